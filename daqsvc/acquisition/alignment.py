@@ -242,7 +242,7 @@ class Aligner:
             self._tell(follower)
 
     def _tell(self, follower: Follower) -> None:
-        """Say once that a stream can be placed, that it no longer can, and that it never could."""
+        """Log once that a stream can be placed, that it no longer can, and that it never could."""
         placing = follower.news(round(SETTLE_NS / NS_PER_S * self._reference.source.rate_hz))
         if placing is None:
             return

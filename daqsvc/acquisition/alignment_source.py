@@ -131,7 +131,7 @@ class SourceCounters:
 class Line:
     """A stream's clock at its last block.
 
-    Times are whole ns, and places are told from the line's own: floats would not hold either for long.
+    Times are whole ns, and places are counted from the line's own: floats would not hold either for long.
 
     Attributes:
         index: sample index.

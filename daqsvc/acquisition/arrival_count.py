@@ -1,4 +1,4 @@
-"""Counting frames that carry no counter: their times of arrival tell how many are missing."""
+"""Counting frames that carry no counter: their times of arrival show how many are missing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TOLERANCE = 0.75
 
 WATCH_FRAMES = 4
 WATCH_MOST_NS = 2_000_000_000
-"""For how many frames' time a late one waits for those after it, which tell whether it was held up."""
+"""For how many frames' time a late one waits for those after it, which show whether it was held up."""
 
 SURE_FRAMES = 50
 """Missing frames up to this number are counted exactly: 0.5 % of rate error is then a quarter of a frame."""
@@ -64,7 +64,7 @@ class ArrivalCount:
         """Go by the nominal rate, as ever."""
 
     def wants_more(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:  # noqa: ARG002
-        """Whether a batch has a late frame, and only those after it can tell whether others are missing.
+        """Whether a batch has a late frame, and only those after it can show whether others are missing.
 
         Args:
             raw: int64 ``[n]``, anything.
@@ -91,7 +91,7 @@ class ArrivalCount:
             watched = missing[late:end]
             lost = int(watched.min())
             if lost and lost_at is None:
-                lost_at = at + late  # what comes after it tells how many are missing: it is placed with that
+                lost_at = at + late  # what comes after it shows how many are missing: it is placed with that
             if lost and late + len(watched) == len(rest_ns):
                 return at + late if lost_at is None else lost_at
             # Past the gap, or to where they have caught up.

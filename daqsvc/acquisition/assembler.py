@@ -128,7 +128,7 @@ class StreamAssembler:
         self._after_restart = False
         self._unplaced: list[Frames] = []
         self._doubtful: Frames | None = None
-        """The last frame that came, if only the next one can tell whether it is the first after a restart."""
+        """The last frame that came, if only the next one can show whether it is the first after a restart."""
         self._asked_ns = 0
         self._advanced_ns = 0
         frame_rate_hz = rate_hz / samples_per_frame
@@ -215,7 +215,7 @@ class StreamAssembler:
         self._place(until_sure=True)
 
     def _go_on(self, now_ns: int) -> None:
-        """The frames after those that were set aside can be placed: where they belong, the clock tells."""
+        """The frames after those that were set aside can be placed: the clock shows where they belong."""
         if self._highest is None:
             return
         away = round((now_ns - self._advanced_ns) / self._time.period_ns / self._per_frame)
@@ -223,7 +223,7 @@ class StreamAssembler:
         self._after_restart = True
 
     def tick(self, now_ns: int) -> None:
-        """Give up waiting for what nothing has come to tell for a while; call every now and then.
+        """Give up waiting for what nothing has come to show for a while; call every now and then.
 
         That is how a gap is closed, and why a counter is behind the clock.
         """

@@ -36,7 +36,7 @@ BACKLOG_S = 60.0
 """But not if they are what a bus may have held back for so long."""
 BACKLOG_FRAMES = 1024
 
-# Without figures: the same trouble is the same sentence each time, and not said again.
+# Without figures: the same trouble is the same sentence each time, and not logged again.
 SENSELESS_WORDS = (
     "the device's counter makes no sense: a quarter of its frames, or more, fit nothing; "
     "check the device, and the place and width of the counter in the layout"

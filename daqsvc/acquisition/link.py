@@ -25,11 +25,11 @@ logger = logging.getLogger(__name__)
 LOGGED_AT_MOST, LOGGED_WITHIN_NS = 3, 60 * NS_PER_S
 
 OFTEN = "; if this repeats, it is logged three times a minute at most"
-"""To be added to what is said for the third time."""
+"""To be added to what is logged for the third time."""
 
 
 class Sparing:
-    """Lets a trouble be said three times a minute at most, and its end only if the trouble was said."""
+    """Lets a trouble be logged three times a minute at most, and its end only if the trouble was logged."""
 
     def __init__(self) -> None:
         self._logged_ns: deque[int] = deque(maxlen=LOGGED_AT_MOST)
@@ -37,13 +37,13 @@ class Sparing:
 
     @property
     def often(self) -> bool:
-        """Whether nothing more is said for now."""
+        """Whether nothing more is logged for now."""
         return len(self._logged_ns) == LOGGED_AT_MOST
 
     def may_say(self) -> bool:
-        """Whether the trouble that there is now is to be said; if so, it counts as said.
+        """Whether the trouble that there is now is to be logged; if so, it counts as logged.
 
-        To be asked again while it lasts: what could not be said at first can be later.
+        To be asked again while it lasts: what could not be logged at first can be later.
         """
         if self._standing:
             return False
@@ -58,23 +58,23 @@ class Sparing:
         return True
 
     def may_take_back(self) -> bool:
-        """Whether the end of the trouble is to be said: once, if the trouble was."""
+        """Whether the end of the trouble is to be logged: once, if the trouble was."""
         was, self._standing = self._standing, False
         return was
 
 
 LOG_AGAIN_S = 3600.0
-"""The same failure is said again after so long."""
+"""The same failure is logged again after so long."""
 
 
 class LoggedOnce:
-    """Lets each failure be said once an hour, by what caused it."""
+    """Lets each failure be logged once an hour, by what caused it."""
 
     def __init__(self) -> None:
         self._logged_s: dict[Hashable, float] = {}
 
     def may_say(self, cause: Hashable) -> bool:
-        """Whether a failure is to be said; if so, it counts as said."""
+        """Whether a failure is to be logged; if so, it counts as logged."""
         now_s = time.monotonic()
         logged_s = self._logged_s.get(cause)
         if logged_s is not None and now_s - logged_s < LOG_AGAIN_S:
@@ -122,7 +122,7 @@ class Backoff:
 
 @dataclass(slots=True)
 class Link:
-    """The state of one link, said once when it goes and once when it is back.
+    """The state of one link, logged once when it goes and once when it is back.
 
     Of one that keeps failing that is logged three times a minute at most.
 

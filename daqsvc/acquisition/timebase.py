@@ -417,7 +417,7 @@ class TimeBase:
     def _line_of_any_rate(self) -> ClockLine | None:
         """The line, if the arrivals are those of a device with its own rate, whatever that is.
 
-        None if they are of a stall, or of frames that were held up: such tell no rate. Where the device has
+        None if they are of a stall, or of frames that were held up: such show no rate. Where the device has
         had another rate before, the arrivals of that time are forgotten.
         """
         drift_ns = FITS * self._nominal_ns

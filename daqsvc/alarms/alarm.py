@@ -118,7 +118,7 @@ FINDINGS = frozenset(
 
 
 class Alarm:
-    """The memory of one alarm. Every method that changes something returns the events that say so.
+    """The memory of one alarm. Every method that changes something returns the events that report it.
 
     Args:
         identity: whose alarm it is.
@@ -235,7 +235,7 @@ class Alarm:
         return {} if self._cause is None else self._cause.units
 
     def change_limits(self, limits: str, earlier: str, at: ClockReading) -> AlarmEvent:
-        """Say that other limits hold from now on; the next good diagnosis is judged by them.
+        """Report that other limits hold from now on; the next good diagnosis is judged by them.
 
         Args:
             limits: in words.
@@ -518,7 +518,7 @@ class Alarm:
         level_before: Level | None = None,
         occurrence: str | None = None,
     ) -> AlarmEvent:
-        """The event of a change that has been made; what is not said before was as it is now."""
+        """The event of a change that has been made; what is not stated before was as it is now."""
         at = request.at
         if kind is EventKind.CHANGED:
             self._changed_ns = at.t_ns

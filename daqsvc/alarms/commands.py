@@ -105,7 +105,7 @@ Line: TypeAlias = Annotated[
         }
     ),
 ]
-"""Printable text in one line; the pattern is what a schema can say of that."""
+"""Printable text in one line; the pattern is what a schema can state of that."""
 Person: TypeAlias = Annotated[Line, Field(min_length=1, max_length=100)]
 Reason: TypeAlias = Annotated[Line, Field(max_length=500)]
 DurationS: TypeAlias = Annotated[float, Field(gt=0)]

@@ -1,4 +1,4 @@
-"""What an alarm tells the world: one immutable event per change, with its cause."""
+"""What an alarm reports: one immutable event per change, with its cause."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ class Doubt(NamedTuple):
 
     Attributes:
         detector: name of the detector.
-        quality: what it said last, ``"missing"`` or ``"not_ok"``.
-        not_ok: whether it has said "not OK"; missing samples since then do not take that back.
+        quality: what it stated last, ``"missing"`` or ``"not_ok"``.
+        not_ok: whether it has stated "not OK"; missing samples since then do not take that back.
         reason: why, in words for a person.
         sensors: the sensors that its statement rests on.
     """
@@ -109,7 +109,7 @@ class AlarmEvent:
         first_out: whether this alarm was the first of its group to stand since the group was normal.
         chattering: whether its returns are held back because it becomes active and returns too often.
         finding: what is found, where a level can have several causes (`Finding.identity`).
-        doubts: of a quality alarm, what is said against the sensor.
+        doubts: of a quality alarm, what counts against the sensor.
         found: the message of the last event that stated what is found; empty if this one's message does,
             or if it is not known.
 

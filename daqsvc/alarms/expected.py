@@ -24,7 +24,7 @@ class Expected:
         self.conditions = set(handling_conditions(handling))
         """Those of the service itself."""
         self.quality: dict[str, dict[str, Sequence[str]]] = {}
-        """Those that say whether a sensor can be judged: their detectors, with the sensors these rest on."""
+        """Those about whether a sensor can be judged: their detectors, with the sensors these rest on."""
 
     def note(self, active_detectors: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
         """Learn more of them.

@@ -1,4 +1,4 @@
-"""Shelving: for how long, and which ends next; what holds where nothing is said; what all alarms count."""
+"""Shelving: for how long, and which ends next; what holds where nothing is stated; what all alarms count."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.commands import AlarmCommand
 
 CALM: Final = AlarmHandling(chatter_raises=0, flood_alarms=0, shelve_at_most_s=86_400.0)
-"""Where nothing is said of it: no alarm chatters, and no number of them is a flood."""
+"""Where nothing is stated of it: no alarm chatters, and no number of them is a flood."""
 
 _UNITS = ((86_400, "d"), (3600, "h"), (60, "m"))
 _LONGEST_S = 1e9
@@ -56,7 +56,7 @@ class ShelvingEnds:
         self._heap: list[tuple[int, str]] = []
 
     def put(self, alarm: str, until_ns: int) -> None:
-        """``alarm`` is shelved until ``until_ns``, whatever was said of it before."""
+        """``alarm`` is shelved until ``until_ns``, whatever was stated of it before."""
         self._until_ns[alarm] = until_ns
         heapq.heappush(self._heap, (until_ns, alarm))
         if len(self._heap) > 2 * len(self._until_ns) + _SLACK:

@@ -258,9 +258,9 @@ class AlarmManager:
         self._doubts.remember(lacking)
 
     def follow(self, before: AlarmManager) -> list[AlarmEvent]:
-        """Say of each alarm that stands if its limits are others than they were; after `resume`.
+        """Report of each alarm that stands if its limits are others than they were; after `resume`.
 
-        What was said when it was raised names the limit of then, and would mislead whoever reads it now.
+        The message when it was raised names the limit of then, and would mislead whoever reads it now.
 
         Args:
             before: the alarms of the same machine until now.
@@ -288,7 +288,7 @@ class AlarmManager:
         self._expected.note({}, conditions)
 
     def begin_anew(self, events: Iterable[AlarmEvent], reason: str) -> list[AlarmEvent]:
-        """Say of every alarm that the journal does not know that it is normal; after `resume`.
+        """Report every alarm that the journal does not know as normal; after `resume`.
 
         Args:
             events: what the journal knows, as of `resume`.
@@ -307,7 +307,7 @@ class AlarmManager:
         ]
 
     def _tell(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
-        """Mark and count events as they come about, and say if they are a flood."""
+        """Mark and count events as they come about, and report if they are a flood."""
         marked = [self._marked(event) for event in events]
         now = self._now()
         sentence = self._flood.sentence(now.t_ns, self._advice)

@@ -330,7 +330,7 @@ class SensorHealth:
             self._lacked_at_restart.pop(detector, None)
 
     def settle(self, name: str) -> None:
-        """Forget all that is said against the subject of the quality alarm ``name``."""
+        """Forget all that counts against the subject of the quality alarm ``name``."""
         for detector in [one for one, (alarm, _) in self._by_detector.items() if alarm == name]:
             self._forget(detector)
             self._lacked_at_restart.pop(detector, None)
@@ -344,14 +344,14 @@ class SensorHealth:
         return [(name, doubt) for name, doubt in self._by_detector.values() if doubt.not_ok]
 
     def excuse(self, detector: str) -> None:
-        """A detector has said since that the sensors are OK."""
+        """A detector has stated since that the sensors are OK."""
         if (before := self._forget(detector)) is not None:
             self._remember(before[0], before[1]._replace(not_ok=False))
 
     def expect(self, name: str, speakers: Mapping[str, Sequence[str]], t_ns: int) -> None:
         """Have the quality alarm ``name`` wait, after `resume`, for who may doubt its sensor, too.
 
-        Who joins in or leaves with nothing new to say makes no event, so the journal may not know of it.
+        Who joins in or leaves with nothing new to state makes no event, so the journal may not know of it.
 
         Args:
             name: of the alarm.
@@ -385,12 +385,12 @@ class SensorHealth:
             self._unsettled_by[detector].add(rule.alarm)
 
     def of(self, name: str) -> tuple[Doubt, ...]:
-        """What is said against the subject of the quality alarm ``name``, by detector."""
+        """What counts against the subject of the quality alarm ``name``, by detector."""
         doubts = self._by_alarm.get(name, {})
         return tuple(sorted(doubt for detector, doubt in doubts.items() if detector not in self._unheard))
 
     def finding(self, name: str) -> RuleFinding:
-        """What the quality alarm ``name`` is to say."""
+        """What the quality alarm ``name`` is to state."""
         doubts = tuple(sorted((*self.of(name), *self._assumed(name))))
         if not doubts:
             return RuleFinding(Level.NORMAL, "good", lambda: f"{name.partition('/')[2]} is good again")
@@ -406,7 +406,7 @@ class SensorHealth:
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` is suppressed while it rests on ``sensors``; None if it is not.
 
-        Its own detector shows that a sensor is not OK, without saying which, or more of its sensors are
+        Its own detector shows that a sensor is not OK, without stating which, or more of its sensors are
         blamed than it can spare.
         """
         if self._unsettled.get(rule.alarm):
@@ -435,7 +435,7 @@ class SensorHealth:
             self._blamed.setdefault(sensor, {})[doubt.detector] = _reason(doubt)
 
     def _forget(self, detector: str) -> tuple[str, Doubt] | None:
-        """Take back what a detector had against its sensors, and say what that was."""
+        """Take back what a detector had against its sensors, and state what that was."""
         before = self._by_detector.pop(detector, None)
         if before is None:
             return None

@@ -30,7 +30,7 @@ SURE = 0.999
 """More digits than this no model of a machine deserves."""
 
 UNDETERMINED = "undetermined"
-"""The decision of a detector that cannot say yet."""
+"""The decision of a detector that cannot decide yet."""
 
 DEPARTURE = "departure"
 """The decision of a detector that sees a change, but not yet of what."""

@@ -191,7 +191,7 @@ class SetpointMonitor:
 
 
 class _Comparator:
-    """One limit: whether it has been reached, and for how long the value has said otherwise."""
+    """One limit: whether it has been reached, and for how long the value has been otherwise."""
 
     def __init__(self, limit: Limit, setpoint: Setpoint) -> None:
         self.limit = limit

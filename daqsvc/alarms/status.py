@@ -36,7 +36,7 @@ class AlarmStatus(NamedTuple):
         shelved_until_ns: end of shelving by the monotonic clock; None if not shelved.
         chattering: whether its returns are held back.
         first_out: whether it was the first of its group.
-        found: the sentence that said what was found last; empty if that is not known.
+        found: the sentence that stated what was found last; empty if that is not known.
     """
 
     state: AlarmState

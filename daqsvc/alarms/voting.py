@@ -115,7 +115,7 @@ class _VotingWatch:
         level = self._level
         for reached in _LEVELS:
             votes = sum(level >= reached for level in valid.values())
-            # A sensor that lacks samples may add its vote, but not say that it has none.
+            # A sensor that lacks samples may add its vote, but not state that it has none.
             if votes + sum(level >= reached for level in sure_of.values()) >= self._rule.vote:
                 level = max(level, reached)
             elif votes + silent < self._rule.vote and level >= reached:

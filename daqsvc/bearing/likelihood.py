@@ -89,7 +89,7 @@ def detection_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
 
 
 class WhittleDetector:
-    """Tells whether the residual holds more than that of the healthy machine.
+    """Tests whether the residual holds more than that of the healthy machine.
 
     Args:
         parameters: of the healthy bearing.

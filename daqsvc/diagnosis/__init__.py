@@ -1,1 +1,1 @@
-"""Detectors: they read rings, run compiled kernels off the event loop, and say what they found."""
+"""Detectors: they read rings, run compiled kernels off the event loop, and state what they found."""

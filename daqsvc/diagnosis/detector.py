@@ -33,7 +33,7 @@ class Detector(Protocol):
         ...
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
-        """Take in a window and say what is worth saying (often nothing).
+        """Take in a window and state what is worth a statement (often nothing).
 
         Must not raise on bad data (NaN, infinities, dead or clipped sensors): it states it in a
         `Diagnosis` whose ``quality`` is not good, and holds its decision.
@@ -41,7 +41,7 @@ class Detector(Protocol):
         ...
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
-        """What to say when the stream has been silent: decisions held, quality ``"missing"``.
+        """The statements when the stream has been silent: decisions held, quality ``"missing"``.
 
         Called on the event loop, once per silence; changes nothing.
 

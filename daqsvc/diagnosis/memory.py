@@ -30,7 +30,7 @@ MOST_VALUES = 100_000
 _DEEPEST = 60
 
 Tree: TypeAlias = Any
-"""What JSON can say; arrays are numbers in a list beside it."""
+"""What JSON can hold; arrays are numbers in a list beside it."""
 
 
 class MemoryNotTakenError(Exception):
@@ -58,7 +58,7 @@ class DetectorMemory(NamedTuple):
         return sum(array.nbytes for array in self.arrays)
 
     def document(self) -> dict[str, Any]:
-        """The same as JSON can say it."""
+        """The same as JSON can hold it."""
         arrays = [
             [array.dtype.str, list(array.shape), base64.b64encode(array.tobytes()).decode()]
             for array in self.arrays

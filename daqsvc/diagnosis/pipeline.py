@@ -71,7 +71,7 @@ class KernelThreads:
 
     Args:
         count: so many calls are made at a time, besides those that are set apart.
-        failed: told, on the thread, that one was interrupted by its own exception; it goes on.
+        failed: called, on the thread, when one was interrupted by its own exception; it goes on.
     """
 
     def __init__(self, count: int, failed: Callable[[BaseException], None]) -> None:
@@ -164,7 +164,7 @@ class KernelThreads:
                 job = self._next(me)
                 if job is not None:
                     self._make(job)
-            except BaseException as error:  # noqa: BLE001 - said and counted there
+            except BaseException as error:  # noqa: BLE001 - reported and counted there
                 self._recover(me, error)
         self._apart.discard(me)
 
@@ -270,7 +270,7 @@ class DetectorCounters:
 
 @dataclass(slots=True)
 class _Cause:
-    """Why nothing comes of a stream, as it was said.
+    """Why nothing comes of a stream, as it was reported.
 
     Attributes:
         why: in a clause; empty if it is not known.
@@ -281,7 +281,7 @@ class _Cause:
     last_ns: int
 
     def is_another(self, why: str, now_ns: int, patience_ns: int) -> bool:
-        """Whether something else is the reason, and has been for long enough to say so.
+        """Whether something else is the reason, and has been for long enough to report it.
 
         A unit that is asked now and then is silent by turns, and set aside because it is.
         """
@@ -298,7 +298,7 @@ class Pipeline:
         rings: by stream name.
         detectors: each names its stream.
         report: called on the event loop with each diagnosis, per detector in order.
-        clock: tells how long a stream has been silent.
+        clock: shows how long a stream has been silent.
         kernels: threads that detectors compute in; None for some of its own.
         settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
         patience: by stream, how long it may be silent; whatever is not named is fast.
@@ -372,7 +372,7 @@ class Pipeline:
 
     @property
     def is_judging(self) -> bool:
-        """Whether a window is being processed of which nothing has been said yet."""
+        """Whether a window is being processed of which nothing has been stated yet."""
         return bool(self._under_way)
 
     def progress(self) -> dict[str, Progress]:
@@ -388,8 +388,8 @@ class Pipeline:
     def stand(self, stream: str, standing: StreamState) -> None:
         """Take in how a stream stands; call on the event loop.
 
-        While nothing can be judged by it its detectors get none of its samples, and hold what they have said.
-        What is said before its rate is known waits for that.
+        While nothing can be judged by it its detectors get no samples, and hold their last statements.
+        What is stated before its rate is known waits for that.
         """
         before, self._standings[stream] = self._standings[stream], standing
         self._doubts_reported[stream] += bool(standing.doubt) and not standing.silent
@@ -474,10 +474,10 @@ class Pipeline:
             await over([*listening, *following])
 
     async def _listen_for_silence(self) -> None:
-        """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
+        """Have detectors state, once, that their stream has fallen silent: no window comes that shows it.
 
-        It is said once more if the bus reports only then why nothing comes, and when that is no longer so or
-        has become another reason, and has been for some seconds.
+        It is stated once more if the bus reports only then why nothing comes, and when that is no longer so
+        or has become another reason, and has been for some seconds.
 
         Of a stream in doubt samples may not come as far as the ring; the doubt states that frames come.
 
@@ -520,7 +520,7 @@ class Pipeline:
                         causes[name] = _Cause(why, now_ns)
 
     def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> str:
-        """Have the detectors of a stream say that nothing comes; returns why, if that is known."""
+        """Have the detectors of a stream state that nothing comes; returns why, if that is known."""
         silence_s = silence_ns / NS_PER_S
         standing = self._standings[stream]
         over, why, beside = self._why_over(stream), self._why_silent(stream), self._bus_quiet(stream)
@@ -637,7 +637,7 @@ class Pipeline:
     def _process(self, detector: Detector, window: Window) -> Sequence[Diagnosis]:
         """What a detector states about a window; on a kernel thread.
 
-        One that raises has judged nothing: what it said before is held, and nothing is said of its sensors.
+        One that raises has judged nothing: its last statement is held, and nothing is stated of its sensors.
         """
         counters = self.counters[detector.name]
         # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
@@ -645,7 +645,7 @@ class Pipeline:
         try:
             statements = window_statements(detector, window)
             self._see_names(detector, statements, window.t_end_ns)
-        except Exception as error:  # noqa: BLE001 - said and counted
+        except Exception as error:  # noqa: BLE001 - reported and counted
             counters.failures += 1
             self._supervisor.failed(_part(detector), error, "it goes on with the next window")
             reason = f"detector {detector.name} has failed: {error_text(error)}"

@@ -128,7 +128,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
             options: what is stated of the recordings.
 
         Returns:
-            Unless overridden, one that condenses what the detectors of `build` say.
+            Unless overridden, one that condenses what the detectors of `build` state.
 
         Raises:
             ValueError: what the table or the options name cannot be used; the message states what to do.
@@ -146,7 +146,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         Args:
             machine: the machine file.
             settings: the table.
-            options: what is said beside it.
+            options: what is stated beside it.
 
         Raises:
             UnfitOptionError: an option has no meaning here.
@@ -161,6 +161,6 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         return ()
 
     def quality_alarms(self, machine: MachineFile, settings: SettingsT) -> Iterable[str]:
-        """Names of the alarms about what its detectors rest on: that these say ``detector-ok`` is enough."""
+        """Names of the alarms about what its detectors rest on: ``detector-ok`` from these is enough."""
         del machine, settings
         return () if self.detector is None else (f"detector-ok/{self.detector}",)

@@ -25,7 +25,7 @@ class Diagnosis:
         first_index: first sample of the window of evidence (absolute index).
         end_index: one past its last sample.
         decision: the mode or level that the detector holds now, e.g. ``"F1L2"`` or ``"alert"``;
-            ``"undetermined"`` while it cannot say.
+            ``"undetermined"`` while it cannot decide.
         where: the part of the machine that it is about, e.g. the name of a bearing; empty if it is about the
             machine as a whole.
         changed: whether ``decision`` differs from the one before.
@@ -45,7 +45,7 @@ class Diagnosis:
         reason: why the quality is not good, in words for a person.
         sensors: names of the sensors that the statement rests on.
         model: name and version of the model behind the decision.
-        missing_share: share of the window's samples that are missing; None if the detector does not say.
+        missing_share: share of the window's samples that are missing; None if the detector does not state it.
         bounds: statistics that are uncertain because samples are missing: between what they lie all the
             same. Such a one may raise an alarm by its bound, and returns none.
     """
@@ -76,7 +76,7 @@ class Diagnosis:
 
     @property
     def partial(self) -> bool:
-        """Whether samples are missing, but not so many that nothing can be said."""
+        """Whether samples are missing, but not so many that nothing can be stated."""
         return self.quality == "missing" and bool(self.bounds)
 
 

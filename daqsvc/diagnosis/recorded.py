@@ -70,7 +70,7 @@ class RecordingOptions:
         unit: unit of the samples in the recording; None: those of the sensors.
         calibration: file with the healthy machine, in place of what the machine file names.
         in_memory: whether the machine file was made of options: its sensors are then called in the file as
-            ``channels`` states, or as they are, and a figure that the recording has to tell is NaN.
+            ``channels`` states, or as they are, and a figure that the recording has to show is NaN.
         patterns: whether a channel may be named by a pattern, or by what its name in the file ends with.
         speed_step_rpm: step of the stated speed's last digit, which it is rounded to; 0: it is exact.
         healthy: a recording of the healthy machine that others are compared with; None without one.
@@ -192,7 +192,7 @@ class Evaluated:
     """What a detector brings forward about a recording.
 
     Attributes:
-        statements: what it said, condensed.
+        statements: what it stated, condensed.
         verdict: what that comes to; None if it gives none by itself.
         draw: writes figures, whose names begin with what it is called with; None if there is nothing to draw.
     """
@@ -267,7 +267,7 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
         Args:
             recorded: the recording, with the machine as far as it has its sensors.
             settings: what `as_recorded` made of the table.
-            progress: told the samples done and to do, now and then.
+            progress: called with the samples done and to do, now and then.
 
         Raises:
             ValueError: it cannot be judged; the message states why.
@@ -277,7 +277,7 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
 
 
 class RecordedLive(RecordedDetector[SettingsT]):
-    """What live detectors say of a recording, condensed, without a verdict.
+    """What live detectors state of a recording, condensed, without a verdict.
 
     Args:
         machine: see `RecordedDetector`.
@@ -375,7 +375,7 @@ class StatementsJson(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Statements:
-    """All that a detector said.
+    """All that a detector stated.
 
     Attributes:
         detector: its name.
@@ -389,7 +389,7 @@ class Statements:
 
     @property
     def last(self) -> Diagnosis | None:
-        """The last statement; None if it said nothing."""
+        """The last statement; None if there is none."""
         return self.diagnoses[-1] if self.diagnoses else None
 
     @property
@@ -477,7 +477,7 @@ def statements_of(detector: Detector, recorded: Recorded) -> tuple[Statements, .
 
 
 def by_name(detector: str, diagnoses: Iterable[Diagnosis], rate_hz: float) -> tuple[Statements, ...]:
-    """What a detector said, apart by whom it is about: a level detector is about each of its sensors.
+    """What a detector stated, by whom it is about: a level detector is about each of its sensors.
 
     Args:
         detector: its name.
@@ -493,7 +493,7 @@ def by_name(detector: str, diagnoses: Iterable[Diagnosis], rate_hz: float) -> tu
 
 
 def worst(statements: Iterable[Statements]) -> str:
-    """The most severe of what several detectors said, in words; empty if all is normal."""
+    """The most severe of what several detectors stated, in words; empty if all is normal."""
     candidates = [(one.detector, one.worst, one.rate_hz) for one in statements if one.worst is not None]
     alarmed = [one for one in candidates if one[1].severity != "normal"]
     if not alarmed:

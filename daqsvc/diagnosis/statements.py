@@ -1,4 +1,4 @@
-"""Asking detectors: what they say is what their contract declares, or their authors are named."""
+"""Asking detectors: what they return is what their contract declares, or their authors are named."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _QUALITIES = get_args(Quality)
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 _BEHIND_NS = 3600 * NS_PER_S
-"""How old the last sample of what is said of a window may be."""
+"""How old the last sample of what is stated of a window may be."""
 
 
 def window_statements(detector: Detector, window: Window) -> Sequence[Diagnosis]:
@@ -73,7 +73,7 @@ def _checked(
 
 
 def asked(hook: Callable[..., T], *of: Any) -> T:
-    """What a detector answers; whatever ends its code is a failure like any other, with words to be said.
+    """What a detector answers; whatever ends its code is a failure like any other, with words to be logged.
 
     Raises:
         Exception: it has failed.
@@ -90,7 +90,7 @@ def asked(hook: Callable[..., T], *of: Any) -> T:
 
 
 def _words(error: BaseException) -> str | None:
-    """What an exception of a detector states; None if it cannot be said, sent or written down."""
+    """What an exception of a detector states; None if it cannot be logged, sent or written down."""
     try:
         words = str(error)
         return words if is_text(words, MOST_WORDS) else None
@@ -154,7 +154,7 @@ def see_statement(one: Diagnosis, earliest_ns: int, latest_ns: int) -> None:
 
     Args:
         one: the statement.
-        earliest_ns: monotonic time before which nothing can be said.
+        earliest_ns: monotonic time before which nothing can be stated.
         latest_ns: monotonic time of the last sample of its window, or now if nothing has come.
 
     Raises:

@@ -29,7 +29,7 @@ _LINE_DB = 15.0
 """A line that stands out: of noise the best of 10,000 bins reaches 12 dB over its median."""
 _SIDEBAND_DB = 12.0
 _ABOUT_BINS = 40
-"""Bins on either side that tell the noise about a line."""
+"""Bins on either side that show the noise about a line."""
 _REACH_BINS = 1.5
 """How far a line may be from where it is looked for."""
 _SKIRT_BINS = (5, 12)
@@ -191,7 +191,7 @@ def drive_lines(levels: LineLevels, shaft_hz: float, *, sharp: bool) -> tuple[Dr
     Args:
         levels: of the signal's spectrum, in which the shaft turns evenly.
         shaft_hz: revolutions per second.
-        sharp: whether the harmonics of the shaft tell them sharply; a gear is looked for only then.
+        sharp: whether the harmonics of the shaft show them sharply; a gear is looked for only then.
     """
     gear = _gear(levels, shaft_hz) if sharp else None
     sources = (gear, motor_lines(levels, shaft_hz, _SHARP if sharp else _VAGUE))

@@ -49,7 +49,7 @@ _MOST_OFF_RATE = 0.05
 _SURELY_SINCE_1970_NS = 10**17
 """Times of 1973 and later; others count from somewhere else."""
 _LONG_ENOUGH_S = 1.0
-"""A shorter log does not tell the rate of a stream."""
+"""A shorter log does not show the rate of a stream."""
 _NAMED_IDS = 8
 _HEAD_BYTES = 1 << 16
 """Of an ASC log, in which its header ends."""
@@ -160,7 +160,7 @@ def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStre
             ) from None
         channels = stream.layout.channel_names
         known = [sensors.get((name, channel)) for channel in channels]
-        # Times of some formats count from the first frame; a date that they say is in their header.
+        # Times of some formats count from the first frame; a date that they state is in their header.
         start_ns = t_ns if t_ns > _SURELY_SINCE_1970_NS else None if begun_ns is None else begun_ns + t_ns
         streams.append(
             RecordedStream(
@@ -180,7 +180,7 @@ def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStre
 
 
 def _log_begin_ns(path: str) -> int | None:
-    """When a log in ASC format began, by its header; None of any other, or if it does not say.
+    """When a log in ASC format began, by its header; None of any other, or if it does not state it.
 
     The header names no zone. It is taken as UTC, so that a log begins at one time wherever it is read.
     """

@@ -34,7 +34,7 @@ class Exported:
 
     Attributes:
         streams: its streams.
-        about: what is said of all of them: names of fields, and their texts.
+        about: what is stated of all of them: names of fields, and their texts.
         notes: what is wrong with it, in sentences.
     """
 
@@ -55,7 +55,7 @@ def read_streams(
         recording: path of a file, of a CAN log, or of a folder of CAN logs.
         machine: the layouts of the frames of a CAN log; of another file, the names and units of its channels.
         channels: what some channels of a file are called from now on, and in the file.
-        rate_hz: samples per second of a file that does not say it.
+        rate_hz: samples per second of a file that does not state it.
 
     Raises:
         ExportUsageError: two of its channels would have one name, or one of them two.
@@ -179,7 +179,7 @@ def _of_table(
 
 
 def _add_sensors(wanted: dict[str, str], machine: MachineFile, there: Collection[str]) -> dict[str, str]:
-    """Add the sensors of a machine that a file has, and tell their units.
+    """Add the sensors of a machine that a file has, and state their units.
 
     Args:
         wanted: channels of the file by their names from now on; sensors come to it.

@@ -1,6 +1,6 @@
 """Options of the command line as a machine file in memory, for recordings of a machine without one.
 
-Its tables are those of the detectors; only figures that a recording has to tell are left open, as NaN. Its
+Its tables are those of the detectors; only figures that a recording has to show are left open, as NaN. Its
 stream is the columns of a file. Nothing is checked here that an option has been checked for.
 """
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _RECORDING = "recording"
 """Name of the machine, its bus and its stream."""
 _ANY_ROTOR = (1.0, 0.1)
-"""Natural frequency and damping ratio of a rotor that a run-up has to tell."""
+"""Natural frequency and damping ratio of a rotor that a run-up has to show."""
 
 
 class WrongValueError(ValueError):
@@ -46,7 +46,7 @@ class WrongValueError(ValueError):
 
 
 def recording_options(arguments: argparse.Namespace, **others: Any) -> RecordingOptions:
-    """What the options say of the recordings.
+    """What the options state of the recordings.
 
     Args:
         arguments: the options of `analyze` or `calibrate`.
@@ -60,7 +60,7 @@ def rotor_machine(arguments: argparse.Namespace) -> MachineFile:
 
     Args:
         arguments: of `daqsvc.commands.recording_options.add_rotor`. What `calibrate` asks is not known yet:
-            natural frequency and damping may be missing, and ``sweep_rpm`` may tell the speed.
+            natural frequency and damping may be missing, and ``sweep_rpm`` may state the speed.
 
     Raises:
         ValueError: the options contradict each other.
@@ -148,7 +148,7 @@ def bearing_machine(arguments: argparse.Namespace) -> MachineFile:
 
 
 def accelerometer_machine(arguments: argparse.Namespace) -> MachineFile:
-    """A machine of which options tell accelerometers and speed only: no detector of the service watches it.
+    """A machine of which options state accelerometers and speed only: no detector of the service watches it.
 
     Args:
         arguments: with ``channels``, ``speed_rpm`` and ``map``.

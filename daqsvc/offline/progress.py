@@ -83,7 +83,7 @@ class ProgressInterval:
         self._bar: Bar | None = None
 
     def update(self, done: int, total: int) -> None:
-        """Tell how much is done."""
+        """Report how much is done."""
         if self._bar is None:
             if done >= total or not self._stream.isatty() or time.monotonic() < self._show_after:
                 return

@@ -2,8 +2,8 @@
 
 The buses are replaced, and the hands that give samples to detectors: these give the windows that were given
 then. So every detector computes the same numbers from the same samples in the same portions. It begins with
-what it remembered then, if the snapshot has that, else again. That nothing came is heard as it was said then,
-and at that time: no sample tells when.
+what it remembered then, if the snapshot has that, else again. That nothing came is heard as it was stated
+then, and at that time: no sample shows when.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ ALARM_TICK_NS = NS_PER_S
 _LONGEST_REASON = 200
 _NOT_REMEMBERED = "the snapshot does not have what it remembered"
 _LISTED = 5
-"""Names that are said one by one."""
+"""Names that are listed one by one."""
 _TURNS = 4
 """Of the event loop, after which whoever woke has done what there was to do."""
 _NOT_OURS = (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError)
 """What comes of a document that this program has not written."""
 _NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence", "code", "found_message")
-"""Of an alarm event: its label of wall time, what is new each time, and what earlier versions did not say."""
+"""Of an alarm event: its label of wall time, what is new each time, and what earlier versions lacked."""
 
 
 class ReplayError(Exception):
@@ -81,13 +81,13 @@ class ReplayError(Exception):
 
 @dataclass(slots=True)
 class Comparison:
-    """What was said then, compared with what is said now.
+    """What was stated then, compared with what is stated now.
 
     Attributes:
-        equal: said then and now, to the last bit.
-        changed: said then and not now.
-        added: said now and not then.
-        later: said now of samples of which the file has no statement any more, as it ended.
+        equal: stated then and now, to the last bit.
+        changed: stated then and not now.
+        added: stated now and not then.
+        later: stated now of samples of which the file has no statement any more, as it ended.
     """
 
     equal: int = 0
@@ -120,7 +120,7 @@ class Replayed:
 
     @property
     def is_equal(self) -> bool:
-        """Whether all that was said then is said now, and nothing else; not if nothing was compared."""
+        """Whether all that was stated then is stated now, and nothing else; not if nothing was compared."""
         return self.is_compared and not (
             self.said.changed or self.said.added or self.alarmed.changed or self.alarmed.added
         )
@@ -321,7 +321,7 @@ class Replay:
         self._ticked_ns = self._begin_ns
 
     def _under_its_name(self, machine: MachineFile) -> MachineFile:
-        """The machine file by the names of the snapshot: they are no physics, but what is said has them."""
+        """The machine file by the names of the snapshot: they are no physics, but statements have them."""
         about = self._snapshot.about
         own = {"site": machine.site, "box": machine.box, "machine": machine.machine.name}
         then = {key: str(about.get(key, name)) for key, name in own.items()}
@@ -500,7 +500,7 @@ class Replay:
             _refuse(error)
 
     def _earlier_statements(self) -> dict[str, deque[Noted]]:
-        """By detector that remembers, what was said by samples that it had judged by the begin, in order.
+        """By detector that remembers, what was stated by samples that it had judged by the begin, in order.
 
         It may have come late, when the detector had got further samples already.
         """
@@ -511,7 +511,7 @@ class Replay:
         return earlier
 
     def _earlier_by(self, noted: Noted) -> str:
-        """The detector that has said something by samples that it had judged by the begin; else nothing."""
+        """The detector that has stated something by samples that it had judged by the begin; else nothing."""
         document = noted.document
         statement = document.get("cause") if noted.topic == ALARMS else document
         if noted.topic not in (ALARMS, DIAGNOSES) or not isinstance(statement, dict) or document.get("by"):
@@ -520,7 +520,7 @@ class Replay:
         return "" if _is_silence(statement) or self._is_replayed(statement) else name
 
     def _follow(self, noted: Noted) -> None:
-        """Have the alarms follow what was said then, if it is not said again."""
+        """Have the alarms follow what was stated then, if it is not stated again."""
         document = noted.document
         earlier = self._earlier.get(self._earlier_by(noted))
         if earlier is not None:
@@ -534,7 +534,7 @@ class Replay:
             self._go_on_from(alarm_event(json.dumps(document).encode()))
 
     def _hear(self, statement: Document) -> None:
-        """Have the alarms hear what was said then, if it is not said again."""
+        """Have the alarms hear what was stated then, if it is not stated again."""
         is_silence = _is_silence(statement)
         if is_silence:
             self._see_silence(statement)
@@ -601,7 +601,7 @@ class Replay:
             self._heard(event)
 
     def _recorded_results(self) -> tuple[list[Document], list[Document]]:
-        """The statements and alarm events of then that are to be said now."""
+        """The statements and alarm events of then that are to come again now."""
         statements: list[Document] = []
         alarmed: list[Document] = []
         others: dict[str, Counter[str]] = {DIAGNOSES: Counter(), ALARMS: Counter()}
@@ -634,7 +634,7 @@ class Replay:
                 )
 
     def _compare(self) -> None:
-        """Hold what was said then against what is said now."""
+        """Compare what was stated then with what is stated now."""
         statements, alarmed = self._recorded_results()
         _hold(self._result.said, statements, [statement_document(one) for one in self._result.statements])
         # What follows of statements that came after the end of the file came after it, too.
@@ -663,7 +663,7 @@ class Replay:
         return statement.get("detector") in self._names and _is_silence(statement)
 
     def _is_judged(self, alarm: Document) -> bool:
-        """Whether an alarm event of then follows of what a detector has said."""
+        """Whether an alarm event of then follows from what a detector has stated."""
         cause = alarm.get("cause")
         return isinstance(cause, dict) and cause.get("detector") in self._names
 

@@ -168,7 +168,7 @@ class CommandIds:
         return bool(old)
 
     def _read(self) -> bool | None:
-        """Read the file; whether it tells all that it was given, None if it is not there."""
+        """Read the file; whether it holds all that was written to it, None if it is not there."""
         try:
             handle = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         except FileNotFoundError:

@@ -328,7 +328,7 @@ class Journal:
                 raise
 
     def _tidy(self) -> None:
-        """Trim, and have the file itself tell where the numbers go on; on a full disk, both can wait."""
+        """Trim, and have the file itself state where the numbers go on; on a full disk, both can wait."""
         connection = self._open_connection()
         try:
             self._mark.advance(self.last_sequence)
@@ -543,7 +543,7 @@ class Journal:
         self._mark.begin(self._next)
 
     def acknowledge(self, numbers: Iterable[int]) -> Acknowledged:
-        """Take in that the broker has messages; the next `write` tells the disk."""
+        """Take in that the broker has messages; the next `write` puts it on disk."""
         return self._unwritten.acknowledge(numbers)
 
     def show(self) -> None:
@@ -789,7 +789,7 @@ class Journal:
         """The journal; while it cannot be opened, a reader of it that needs no room on the disk.
 
         Raises:
-            sqlite3.Error: it cannot be examined, or may say what the disk never got (see `_prove`).
+            sqlite3.Error: it cannot be examined, or may hold what the disk never got (see `_prove`).
             OSError: as above.
         """
         if self._is_ready or self._connection is not None or self._lock is None:

@@ -37,7 +37,7 @@ class KnownTopics:
         self._path = path
         self._topics: frozenset[str] | None = None
         self._is_sound = False
-        """Whether the file tells all of them, so that a line can be added to it."""
+        """Whether the file lists all of them, so that a line can be added to it."""
 
     @property
     def topics(self) -> frozenset[str] | None:

@@ -64,7 +64,7 @@ class JournalEntry:
 
 @dataclass(frozen=True, slots=True)
 class JournalView:
-    """What the journal told at one moment.
+    """What the journal held at one moment.
 
     Attributes:
         latest: the latest state of each topic, in order.
@@ -305,7 +305,7 @@ def opened_to_read(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _check_readable(path: Path) -> None:
-    """Raise what SQLite would not tell apart, without a handle: closing one undoes this process's locks."""
+    """Raise what SQLite would not distinguish, without a handle: closing one undoes this process's locks."""
     refuse_foreign(path)
     if not os.access(path, os.R_OK, effective_ids=True):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))

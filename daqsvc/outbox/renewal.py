@@ -107,9 +107,9 @@ class Renewal:
         Args:
             source: the corrupt journal.
             below: the first number that was never used.
-            last: the highest number that was, as far as the side files tell.
+            last: the highest number that was, as far as the side files show.
             wall_ns: wall clock, ns since the Unix epoch.
-            others: messages from elsewhere, which count where the source does not tell them.
+            others: messages from elsewhere, which count where the source does not hold them.
 
         Returns:
             How many messages were saved.
@@ -177,7 +177,7 @@ class Renewal:
             )
 
     def untold(self) -> JournalDamage:
-        """What an earlier run could not tell any more."""
+        """What an earlier run could not report any more."""
         try:
             note = json.loads(read_whole(self._note, 1024))
             return JournalDamage(int(note["quarantined"]), int(note["vanished"]))

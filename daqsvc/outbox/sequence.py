@@ -3,7 +3,7 @@
 Consumers drop a message whose number they have seen, so a number that is used twice loses an alarm. The
 journal itself knows its highest number, but it can forget: a new file takes the place of a corrupt one. A
 write-ahead log with a flipped bit ends, for SQLite, before that bit; a disk that lies about its cache loses
-in a power cut what it had confirmed. So two side files of one line each tell, apart from the database:
+in a power cut what it had confirmed. So two side files of one line each state, apart from the database:
 
 - the *ceiling*, ahead of every number in use and durable before one is used;
 - the highest number *used* and the *first* one of this run, without a sync: a lower bound after a crash;
@@ -61,7 +61,7 @@ _LONGEST = 1024
 
 @dataclass(frozen=True, slots=True)
 class _Told:
-    """What a side file tells; see the top of this module."""
+    """What a side file states; see the top of this module."""
 
     ceiling: int
     used: int
@@ -102,7 +102,7 @@ class SequenceMark:
         self._noted = True
 
     def read(self, place: str) -> None:
-        """Read what the side files tell; without one, nothing is known.
+        """Read what the side files state; without one, nothing is known.
 
         Args:
             place: where the store is by now, see `place_of`.
@@ -111,7 +111,7 @@ class SequenceMark:
         self._here = replace(_NOTHING, boot=boot_id(), place=place)
         sides = [side.read() for side in self._sides]
         sound = [mark for mark in sides if mark is not None]
-        # An earlier version wrote the first one alone, and said nothing of the place.
+        # An earlier version wrote the first one alone, and stated nothing of the place.
         is_earlier = [mark is not None and not mark.place for mark in sides] == [True, False]
         self._damaged = 0 < len(sound) < len(sides) and not is_earlier
         self._damaged |= any(
@@ -216,7 +216,7 @@ class SequenceMark:
         self._mark = replace(self._mark, ceiling=ceiling, boot=here.boot, place=here.place, ended=False)
 
     def can_be_used(self, number: int) -> bool:
-        """Whether ``number`` may have been given, as far as the side files tell."""
+        """Whether ``number`` may have been given, as far as the side files show."""
         return not self._mark.ceiling or self._damaged or 0 <= number <= self._mark.ceiling
 
     def advance(self, last: int) -> None:
@@ -241,7 +241,7 @@ class SequenceMark:
                 raise
 
     def drift(self, *, ahead: bool) -> None:
-        """Tell, durably if the disk takes it, whether the broker may be ahead of the journal."""
+        """Write, durably if the disk takes it, whether the broker may be ahead of the journal."""
         if ahead == self._mark.ahead:
             return
         self._mark = replace(self._mark, ahead=ahead)
@@ -334,7 +334,7 @@ class _Side:
         return self._file is not None
 
     def read(self) -> _Told | None:
-        """What it tells; None if it is not there or damaged."""
+        """What it states; None if it is not there or damaged."""
         self._size, self.is_there = 0, False
         restrict(self.path)
         try:
@@ -348,7 +348,7 @@ class _Side:
         return _understood(line)
 
     def write(self, line: bytes) -> None:
-        """Have it tell ``line``, durably."""
+        """Have it hold ``line``, durably."""
         if self._file is not None and not os.fstat(self._file).st_nlink:
             self.close()  # somebody has deleted it
         if self._file is None and self._size == len(line):
@@ -411,7 +411,7 @@ def _hexadecimal(text: bytes) -> int | None:
 
 
 def boot_id() -> str:
-    """Which boot of the system this is; `UNKNOWN_BOOT` where it does not tell."""
+    """Which boot of the system this is; `UNKNOWN_BOOT` where it does not state it."""
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip() or UNKNOWN_BOOT
     except OSError:
@@ -419,7 +419,7 @@ def boot_id() -> str:
 
 
 def place_of(lock: BinaryIO) -> str:
-    """What tells a store from its copies: the lock file's inode and the time when that was last changed.
+    """What only this store has, and no copy: the lock file's inode and the time when that was last changed.
 
     The lock file is never written. No program can copy the time, so that a copy, also one that is put back
     in the place of the original, has another.

@@ -195,7 +195,7 @@ class Outbox:
     async def oldest_wall_ns(self) -> int | None:
         """When the oldest event happened that the broker has not acknowledged; None if there is none.
 
-        By the payload, ns since the Unix epoch; None also for one that does not say it.
+        By the payload, ns since the Unix epoch; None also for one that does not state it.
         """
         for message in await self.pending(0, 1) if self.counters.depth or self.counters.waiting else ():
             with contextlib.suppress(ValueError, KeyError, TypeError):
@@ -340,7 +340,7 @@ class _Books:
             await self._arrived.wait()
 
     def refusal(self) -> OutboxError:
-        """Count a message that is refused, say so loudly once, and give the reason."""
+        """Count a message that is refused, log it once as an error, and give the reason."""
         waiting = self._counters.waiting
         self._counters.refused += 1
         if not self._refusing:

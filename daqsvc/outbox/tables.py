@@ -113,7 +113,7 @@ def bring_up_to_date(connection: sqlite3.Connection, version: int, wall_ns: int)
     Args:
         connection: to the file.
         version: what the file has; 0 for a new one.
-        wall_ns: wall clock, for messages of a version that did not tell theirs.
+        wall_ns: wall clock, for messages of a version that did not store theirs.
 
     Raises:
         sqlite3.Error: the file is as it was.

@@ -153,7 +153,7 @@ class Telemetry:
             post(_finish, ended, None)
 
     def _serve(self, post: Callable[..., None]) -> bool:
-        """Work until told to end; False after a failure, which costs what was being written."""
+        """Work until stopped; False after a failure, which costs what was being written."""
         try:
             self.file.open()
             post(self._settle, self.file.last_number)

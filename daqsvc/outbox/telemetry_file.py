@@ -301,7 +301,7 @@ class TelemetryFile:
         """Keep the newest messages in memory and give the file's room back."""
         newest = self._newest()
         self.close()
-        with contextlib.suppress(OSError):  # it is the disk that fails; the log below tells
+        with contextlib.suppress(OSError):  # it is the disk that fails; the log below reports it
             if self.is_ours():
                 delete(self._path)
         self._connection = connect(":memory:", synchronous="OFF")

@@ -519,6 +519,6 @@ def succeed(future: asyncio.Future[_T], result: _T) -> None:
 
 
 def fail(future: asyncio.Future[Any], error: Exception) -> None:
-    """Tell whoever still waits why there is no answer."""
+    """Answer whoever still waits why there is no result."""
     if not future.done():
         future.set_exception(error)

@@ -25,7 +25,7 @@ def written_by(path: Path) -> str:
     """The version that has opened the journal ``path`` last; empty if that is not known."""
     try:
         return read_whole(version_file(path), _MOST_BYTES).decode("ascii", "replace").strip()
-    except OSError:  # of before versions were noted, or not readable: then nothing is said of it
+    except OSError:  # of before versions were noted, or not readable: then nothing is reported of it
         return ""
 
 

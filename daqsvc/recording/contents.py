@@ -67,7 +67,7 @@ class Elsewhere:
     """A channel that a file holds beside those of its `Contents`, as it was not taken together with them.
 
     Attributes:
-        why: what is said behind the channel and the file, where it cannot be had together with others.
+        why: what is reported behind the channel and the file, where it cannot be had together with others.
         read: makes the contents that have it.
     """
 
@@ -167,7 +167,7 @@ def _in_words(name: str, values: NDArray[np.generic]) -> str:
 
 
 def left_out(of_other_rates: Mapping[str, str]) -> list[str]:
-    """What to say of channels that are not read, in sentences; see `Contents.of_other_rates`."""
+    """The notes about channels that are not read, in sentences; see `Contents.of_other_rates`."""
     by_reason: dict[str, list[str]] = {}
     for name, why in of_other_rates.items():
         by_reason.setdefault(why, []).append(name)

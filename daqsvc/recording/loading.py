@@ -226,7 +226,7 @@ class _Begins:
 
     @classmethod
     def of(cls, contents: Contents, in_file: Sequence[str], rate_hz: float) -> _Begins:
-        """The begins of channels by their names in the file; those that say none begin with the others."""
+        """The begins of channels by their names in the file; those that state none begin with the others."""
         known = {name: contents.starts_ns[name] for name in in_file if name in contents.starts_ns}
         if not known:
             return cls()

@@ -67,7 +67,7 @@ class _TimeColumn:
         name: of the column.
         unit: it was read in, in words.
         unit_is_named: whether the file states that.
-        stamps: what its stamps say.
+        stamps: what its stamps show.
     """
 
     name: str
@@ -225,7 +225,7 @@ def _refuse_contradictions(
 
 
 def _other_rates(stated: Mapping[str, float], column: _TimeColumn | None, given_hz: float) -> str:
-    """The rates that a file tells, in words, if none is the one that is given; else empty."""
+    """The rates that a file states, in words, if none is the one that is given; else empty."""
     agreed = any(abs(hz / given_hz - 1.0) <= SAME_RATE for hz in stated.values()) or (
         column is not None and column.agrees(given_hz)
     )
@@ -253,7 +253,7 @@ def time_column(contents: Contents, length: int) -> str | None:
 
 
 def _time(path: Path, contents: Contents, length: int, channels: Collection[str]) -> _TimeColumn | None:
-    """The column of time: the first even one, else the first that tells the mean rate at least.
+    """The column of time: the first even one, else the first that shows the mean rate at least.
 
     Raises:
         RecordingError: it lacks most of the samples.
@@ -357,7 +357,7 @@ _SHORT_STEP_DAYS = 1e-6
 
 
 def _clock(values: NDArray[np.generic], since_first: Floats) -> _Clock | None:
-    """How a column counts time that does not say it; None if it may be in seconds since any moment."""
+    """How a column counts time that does not state it; None if it may be in seconds since any moment."""
     first = float(values[0])
     if _EXCEL.least <= first <= _EXCEL.most:
         known = since_first[np.isfinite(since_first)]

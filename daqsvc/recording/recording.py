@@ -69,7 +69,7 @@ class _ReadingLimits:
 
 
 def set_limits(limits: ResourceLimits) -> None:
-    """Say what reading one recording may take, from now on.
+    """State what reading one recording may take, from now on.
 
     Args:
         limits: of the process that reads them.
@@ -196,7 +196,7 @@ def load_streams(
 
     Returns:
         For each stream its samples, float64 ``[n, channels]`` in the units of the file, and notes as in
-        `Recording`. Samples that are missing by a column of time are NaN. Where the file tells another rate
+        `Recording`. Samples that are missing by a column of time are NaN. Where the file states another rate
         a note states it.
 
     Raises:

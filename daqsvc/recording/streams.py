@@ -49,7 +49,7 @@ class RecordedStream:
         names: of the channels: those of the sensors where there are any.
         units: of the channels; empty where none is stated.
         samples: float ``[n, channels]`` in these units; NaN where samples are missing.
-        start_ns: wall time of the first sample, ns since the Unix epoch; None if the recording does not say.
+        start_ns: wall time of the first sample, ns since the Unix epoch; None if not stated.
         measured_hz: samples per second by the clock of the box; None if it was not measured.
     """
 
@@ -90,7 +90,7 @@ class RecordedStream:
 
 
 def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, list[str]]:
-    """A stream as any format can take it, as files may say what they like.
+    """A stream as any format can take it, as files may state what they like.
 
     Args:
         stream: as it was read.

@@ -1,1 +1,1 @@
-"""Snapshots: what a machine's box saw and said around an alarm, in one file that other tools read."""
+"""Snapshots: what a machine's box measured and stated around an alarm, in one file that other tools read."""

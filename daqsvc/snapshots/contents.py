@@ -44,7 +44,7 @@ class Noted:
 
     Attributes:
         topic: its kind.
-        document: what JSON can say of it.
+        document: what JSON can hold of it.
     """
 
     topic: str

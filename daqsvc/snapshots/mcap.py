@@ -30,7 +30,7 @@ MOST_CHANNELS = 4096
 
 
 class McapError(Exception):
-    """A file that is none of this kind, or holds what is not read; to be said behind the file's name."""
+    """A file that is none of this kind, or holds what is not read; to be reported behind the file's name."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from daqsvc.snapshots.contents import Document
 
 WAS_CUT = "was cut before any sample was written in it; copy it again, or give another one"
-"""What is said behind a snapshot of which only the begin is there."""
+"""What is reported behind a snapshot of which only the begin is there."""
 _REMEDY = "it may be damaged: copy it again, or give another one"
 
 

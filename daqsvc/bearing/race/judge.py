@@ -113,7 +113,7 @@ def race_test(
     rules: RaceRules | None = None,
     baseline: RaceBaseline | None = None,
 ) -> RaceVerdict:
-    """Say which part of a bearing is damaged, if any.
+    """State which part of a bearing is damaged, if any.
 
     Args:
         samples: ``[n]``, acceleration of the bearing's housing in any unit; 2.5 s or more for the races,
@@ -326,7 +326,7 @@ def _occupied(samples: NDArray[np.float64], rate_hz: float, rules: RaceRules) ->
 
 
 def _empty_above(top_hz: float, rate_hz: float) -> str:
-    """What to say of a record that holds nothing above some frequency."""
+    """The note about a record that holds nothing above some frequency."""
     return (
         f"nothing above {top_hz:.0f} Hz at a sample rate of {rate_hz:g} Hz: low-passed, or sampled at about "
         f"{2e-3 * top_hz:.2g} kHz and upsampled"

@@ -120,7 +120,7 @@ class RaceVerdict:
         false_alarm_probability: what the significance limit is set to, per test of three parts, in noise.
         level_db: broadband level over the baseline; None without one.
         notes: what a reader should know, e.g. ``"ball not testable here: ..."``.
-        repairs: those of the notes that say what was wrong with the samples and put right; while there are
+        repairs: those of the notes that state what was wrong with the samples and put right; while there are
             any, ``"normal"`` clears nothing.
         drives: gears and motors whose lines stand out, and are taken for no part's.
         spectrum: for figures.

@@ -48,7 +48,7 @@ def calibrate_bearings(
     orders = {bearing.sensor: orders_of(bearing, index) for index, bearing in enumerate(settings.bearings)}
     _refuse_faults(recording, orders, speed_rpm)
     watched_hz = machine.streams[machine.sensor(settings.bearings[0].sensor).stream].rate_hz
-    # Options do not tell the rate of a stream: it is that of the recording then.
+    # Options do not state the rate of a stream: it is that of the recording then.
     rate_hz = watched_hz if abs(recording.rate_hz / watched_hz - 1.0) > SAME_RATE else recording.rate_hz
     groups = [tuple(bearing.sensors) for bearing in settings.bearings]
     if together and len(groups) > 1:

@@ -282,7 +282,7 @@ def _inner_order(bearing: WatchedBearing) -> float | None:
 
 
 def _lines(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
-    """The lines of a bearing lie below half the rate, where samples tell them."""
+    """The lines of a bearing lie below half the rate, where samples show them."""
     sensor = named(draft).get(bearing.sensor)
     inner = _inner_order(bearing)
     if inner is None or sensor is None or sensor.stream not in draft.streams:

@@ -139,7 +139,7 @@ class BearingDetector:
     Every 2.5 s the last ten seconds are evaluated (`RaceWatch`), each bearing by the accelerometer on its
     housing; the bearing that shows most decides. What the healthy machine's own vibration cannot predict
     states whether anything has changed. The first seconds, or a baseline of an earlier time, are the healthy
-    machine; seconds that show a fault or are not steady are not taken for it, and the reason is said.
+    machine; seconds that show a fault or are not steady are not taken for it, and the reason is stated.
 
     Decisions are ``undetermined``, ``normal``, ``changed``, ``inner``, ``outer``, ``ball`` and
     ``inner_or_outer``. Two evaluations must agree before a fault is raised, eight before it is withdrawn. Any
@@ -149,7 +149,7 @@ class BearingDetector:
     nothing. The decision is held and the reason stated, unless another bearing shows a fault.
 
     A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` states how that
-    joins what the lines say. With a keyphasor the lines are looked for at the measured speed. Where that
+    joins what the lines show. With a keyphasor the lines are looked for at the measured speed. Where that
     leaves the tolerance of the race test, the evidence begins again; at another speed than the healthy
     machine's nothing is compared with it. Neither clears anything.
 
@@ -212,7 +212,7 @@ class BearingDetector:
         return self._persistence.standing
 
     def warm(self) -> None:
-        """See `Detector.warm`: makes the tables of the transforms, compiles what tells races by direction."""
+        """See `Detector.warm`: makes the tables of the transforms, compiles the test of direction."""
         samples = round(WINDOW_S * self._rate_hz)
         noise = np.random.default_rng(1).standard_normal((samples, 2))
         RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).evaluate(noise[:, 0])
@@ -391,7 +391,7 @@ class BearingDetector:
         )
 
     def _directed(self, bearing: HousedBearing, samples: Floats, *, suspected: bool) -> dict[str, Direction]:
-        """What the two accelerometers of a bearing tell; empty if it has one only."""
+        """What the two accelerometers of a bearing show; empty if it has one only."""
         if bearing.name not in self._directions or not self._comparable:
             return {}
         pair = samples[:, list(bearing.columns)]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Direction:
-    """What two accelerometers say of an evaluation.
+    """What two accelerometers show in an evaluation.
 
     Attributes:
         detected: whether the residual is not the healthy machine's.
@@ -104,7 +104,7 @@ class RaceDirection:
             suspected: name the race even if nothing is detected: something else has found a fault.
 
         Returns:
-            None if too much is missing to tell.
+            None if too much is missing to decide.
         """
         self._monitor.reset()
         try:

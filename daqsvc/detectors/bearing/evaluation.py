@@ -29,7 +29,7 @@ class Evaluation:
     Attributes:
         races: of each bearing that could be judged, by name.
         changes: of the innovations at each of them; empty without a healthy machine.
-        directions: what two accelerometers tell, of each bearing that has two.
+        directions: what two accelerometers show, of each bearing that has two.
         quality: what the samples are worth.
         reason: why they are not good.
         finding: what the bearings show together; None if none could be judged.

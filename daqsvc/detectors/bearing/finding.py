@@ -1,7 +1,7 @@
 """From the bearings of a machine, each judged by itself, to one statement about the machine.
 
 A fault is heard at the far bearing, too: the bearing that shows most is the faulty one. That the machine has
-changed at all is for the innovations of its healthy model to say, where there is one, and for the residual of
+changed at all is decided by the innovations of its healthy model, where there is one, and for the residual of
 two accelerometers, where a bearing has them.
 
 Lines and direction join so. Lines that stand out name a part by themselves. The direction settles which race
@@ -67,7 +67,7 @@ def find(
         verdicts: of each bearing that could be judged, by name; at least one.
         change: of the innovations; None without a healthy machine to compare with.
         false_alarm_probability: that ``change`` was judged at.
-        directions: what the two accelerometers of a bearing tell, of those that have two.
+        directions: what the two accelerometers of a bearing show, of those that have two.
     """
     directions = directions or {}
     deciding = {name: one for name, one in directions.items() if one.decides}

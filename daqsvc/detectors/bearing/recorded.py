@@ -364,7 +364,7 @@ def _against(rate_hz: float, judge: Judge, healthy: HealthyRun | None) -> Bearin
 def analyse_bearings(
     recording: Recording, setup: BearingSetup, baseline: BearingBaseline | None = None
 ) -> BearingVerdict:
-    """Say which bearing of a machine is damaged, and where.
+    """State which bearing of a machine is damaged, and where.
 
     Args:
         recording: to be judged.

@@ -36,7 +36,7 @@ _TWICE_TOLERANCE = 0.1
 
 
 def stated_speed_problem(recording: Recording, speed_rpm: float) -> str:
-    """What to say of a speed that the file states otherwise; empty if there is nothing to say."""
+    """The note about a speed that the file states otherwise; empty if there is none."""
     stated = {name: rpm for name, rpm in recording.scalars.items() if _RPM_NAME.fullmatch(name) and rpm > 0.0}
     if not stated or any(abs(rpm / speed_rpm - 1.0) <= _SAME_SPEED for rpm in stated.values()):
         return ""
@@ -45,7 +45,7 @@ def stated_speed_problem(recording: Recording, speed_rpm: float) -> str:
 
 
 def meant_in_hz(recording: Recording, setup: BearingSetup) -> str:
-    """What to say of a speed that is that of the shaft in revolutions per second; empty if it is not."""
+    """The note about a speed that is that of the shaft in revolutions per second; empty if it is not."""
     meant_rpm = 60.0 * setup.speed_rpm
     if setup.speed_rpm > _LIKE_HZ_RPM:
         return ""
@@ -64,7 +64,7 @@ def against_healthy_run(recording: Recording, setup: BearingSetup) -> tuple[str,
     """The evidence against a recording as the healthy run.
 
     Args:
-        recording: said to be of the machine in good order.
+        recording: stated to be of the machine in good order.
         setup: what is known.
 
     Returns:

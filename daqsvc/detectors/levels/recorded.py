@@ -1,4 +1,4 @@
-"""The levels of a recording: what the live detectors say of it, without a phase where it has no keyphasor."""
+"""The levels of a recording: those of the live detectors, without a phase where it has no keyphasor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of a sensor's level: compared with its setpoints, and kept while the data is not good."""
+"""What is stated of a sensor's level: compared with its setpoints, and kept while the data is not good."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class TrendChannel:
         unit: its unit.
         limits: its setpoints.
         ok_between: OK limits, in its unit; beyond them the sensor is not believed. None: there are none.
-        number_keys: the keys of its layout that say how bytes become a number, e.g. ``"order and type"``;
+        number_keys: the keys of its layout that state how bytes become a number, e.g. ``"order and type"``;
             empty where there are no such keys.
     """
 
@@ -147,7 +147,7 @@ class TrendDetector:
     def _judge(
         self, channel: TrendChannel, samples: NDArray[np.float32], evidence: Evidence
     ) -> Diagnosis | None:
-        """What is to be said of the next value; None while the last one still represents a missing one."""
+        """The statement about the next value; None while the last one still represents a missing one."""
         known = samples[np.isfinite(samples)]
         if not len(known):
             self._missed[channel.sensor] += 1
@@ -213,7 +213,7 @@ def _as_read(known: NDArray[np.float32]) -> float:
 def _no_rms(channel: TrendChannel, known: NDArray[np.float32]) -> str:
     """Why values are no velocity RMS of a machine, in a clause; empty if they may be, or are something else.
 
-    Only where zones of a standard say that it is one: such a value is never negative, and never so large.
+    Only where zones of a standard show that it is one: such a value is never negative, and never so large.
     """
     if all(limits.zones is None for limits in channel.limits):
         return ""

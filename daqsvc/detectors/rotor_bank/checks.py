@@ -79,7 +79,7 @@ def check_bank_alarm(bank: RotorBank, at: KeyPath) -> Iterator[Finding]:
 
 
 def _measured(bank: RotorBank) -> Iterator[Finding]:
-    """What a run-up does not know of today's machine, its first revolutions tell."""
+    """What a run-up does not know of today's machine, its first revolutions show."""
     if bank.calibration is not None and bank.calibrate_revolutions == 0:
         yield Finding(
             (*_BANK, "calibrate_revolutions"),
@@ -93,7 +93,7 @@ def _modelled(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
     """What only the models of the bank need to know of the rotor."""
     rotor = draft.machine.rotor
     if rotor is None:
-        return  # said already
+        return  # reported already
     for key, about, example in (
         ("eccentricity_um", "mass eccentricity", "10.0"),
         ("contact_stiffness", "stiffness of the stator", "30.0"),
@@ -240,7 +240,7 @@ def physics_checks(draft: MachineFile, bank: RotorBank) -> Iterator[Iterator[Fin
     """
     rotor = draft.machine.rotor
     if rotor is None:
-        return  # said already
+        return  # reported already
     yield _noise(rotor, bank)
     yield _natural_frequency(draft, rotor, bank)
     for index, mode in enumerate(bank.modes[1:], 1):

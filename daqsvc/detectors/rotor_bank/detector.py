@@ -264,7 +264,7 @@ class RotorBankDetector:
         first_index = window.first_index
         gap = 0 if self._next_index is None else first_index - self._next_index
         if window.breaks:
-            # At which angle the shaft is by now, only the next pulses tell; its speed is what it was.
+            # At which angle the shaft is by now, only the next pulses show; its speed is what it was.
             self._begin_anew(keep_speed=True)
         elif 0 < gap <= self._nominal_period:
             samples = np.concatenate((np.full((gap, 3), np.nan), samples))
@@ -454,7 +454,7 @@ class RotorBankDetector:
     def _calibrate(
         self, xy: Floats, cos: Floats, sin: Floats, verdict: RevolutionQuality, end_index: int, t_ns: int
     ) -> list[Diagnosis]:
-        """Measure the healthy motion; at the end, put it into every mode and say so."""
+        """Measure the healthy motion; at the end, put it into every mode and report it."""
         assert self._calibration is not None  # noqa: S101 - the caller asks while there is one
         self._calibration.add(xy, cos, sin)
         if self._calibration.samples < self._calibrate_revolutions * self._tracker.period_samples:

@@ -1,4 +1,4 @@
-"""Figures of what a rotor bank said over a recording; need matplotlib."""
+"""Figures of what a rotor bank stated over a recording; need matplotlib."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw_bank(recording: Recording, statements: Statements, modes: Iterable[str]
 
     Args:
         recording: the recording.
-        statements: all that the bank said.
+        statements: all that the bank stated.
         modes: names of its modes.
         prefix: what the file's name begins with, directory included.
 

@@ -71,7 +71,7 @@ def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[s
 
     Args:
         recording: the recording.
-        statements: all that the bank said.
+        statements: all that the bank stated.
         faults: the fault that each mode represents.
     """
     quality = known_against(recording)

@@ -34,7 +34,7 @@ _SEVERITIES: tuple[Severity, ...] = ("normal", "alert", "danger")
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Where in the stream something is said.
+    """Where in the stream something is stated.
 
     Attributes:
         first_index: first sample of the evidence.

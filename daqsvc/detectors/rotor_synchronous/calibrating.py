@@ -1,6 +1,6 @@
 """From recordings of a healthy machine to what a calibration file holds of it.
 
-A recording through which the speed goes up or down tells the rotor. One at steady speed tells the baseline at
+A recording through which the speed goes up or down shows the rotor. One at steady speed shows the baseline at
 that speed, by the detector that watches the machine live (`analyse`), over all of its revolutions.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _ENDS = 0.02
-"""Part of the revolutions at either end of the speeds that does not say whether a recording is a run-up."""
+"""Part of the revolutions at either end of the speeds that does not show whether a recording is a run-up."""
 _SAME_SPEED = 0.01
 """Baselines at speeds that differ by less than this part are of one speed."""
 

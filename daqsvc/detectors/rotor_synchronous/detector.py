@@ -75,7 +75,7 @@ class RotorSynchronousDetector:
 
     One `Diagnosis` a revolution at most: when something changes, at each look at a change, and else once a
     second. A revolution with missing samples, a dead or clipped probe, an unknown angle, or a speed
-    farther than 5 % from the calibrated one is not judged. The decision is held and the reason said. A
+    farther than 5 % from the calibrated one is not judged. The decision is held and the reason stated. A
     calibration that is refused is a quality that is not good, with the reason, until one succeeds.
 
     A shaft that turns clockwise is viewed from its other end (x mirrored): its whirl is then forward, and
@@ -316,7 +316,7 @@ class RotorSynchronousDetector:
         self._watch.revolutions = revolutions
 
     def _blind(self) -> Diagnosis | None:
-        """What to say when no revolution has come out for too long."""
+        """The statement when no revolution has come out for too long."""
         slowest_rpm = min(self._speed_rpm, self._stated_rpm)
         patience = _ORBIT_LOCK_REVOLUTIONS if self._reference == "orbit" else _BLIND_REVOLUTIONS
         if self._turns.waiting_samples <= patience * 60.0 * self._rate_hz / slowest_rpm:
@@ -372,7 +372,7 @@ class RotorSynchronousDetector:
 
 
 def _cannot_fit(revolution: Revolution) -> str:
-    """Why the samples of a revolution do not tell its harmonics."""
+    """Why the samples of a revolution do not show its harmonics."""
     missing = int((~np.isfinite(revolution.raw).all(axis=1)).sum())
     if missing:
         return (

@@ -65,7 +65,7 @@ _NO_MEAN = (
 _MOST_REFERENCE = 2000
 """Revolutions that the baseline grows to (`daqsvc.rotor.synchronous.departure`)."""
 _SEEN = 128
-"""Revolutions that say what a healthy machine looks like at the end."""
+"""Revolutions that show what a healthy machine looks like at the end."""
 
 
 class RecordedRotor(RecordedDetector[RotorSynchronous]):
@@ -176,10 +176,10 @@ def analyse(recording: Recording, setup: RotorSetup, progress: Progress | None =
     Args:
         recording: with the channels of ``setup.names``, by their names there.
         setup: what is known.
-        progress: told the samples done and to do, now and then.
+        progress: called with the samples done and to do, now and then.
 
     Returns:
-        The verdict; a recording that cannot be judged has ``refused`` say why. Never raises on bad data.
+        The verdict; a recording that cannot be judged has ``refused`` state why. Never raises on bad data.
     """
     quality = checks.known_against(recording)
     watched = _Watched()
@@ -267,7 +267,7 @@ def _healthy_state(setup: RotorSetup, speed_rpm: float) -> Calibration | None:
         return baseline_at(setup.calibrations, speed_rpm)
     except ValueError as error:
         if all(one.fit_error is not None for one in setup.calibrations):
-            return None  # a run-up tells the rotor at any speed
+            return None  # a run-up shows the rotor at any speed
         raise RefusedError(str(error)) from None
 
 
@@ -405,7 +405,7 @@ class _Conclusion:
         return min(_MOST_REFERENCE, calibration.revolutions + max(0, watched))
 
     def _healthy_evidence(self, calibration: Calibration, calibrated: int) -> Mapping[RotorFault, float]:
-        """What the last revolutions of a machine that has not departed say for every hypothesis."""
+        """What the last revolutions of a machine that has not departed show for every hypothesis."""
         recent = self.vectors[max(calibrated, len(self.vectors) - _SEEN) :]
         if not len(recent):
             return {}
@@ -421,7 +421,7 @@ class _Conclusion:
 
 
 def history(reports: Sequence[WatchReport], last: Identification | None) -> tuple[ModeStep, ...]:
-    """Every change of what the watch said, and at the end the last evaluation if it said something else."""
+    """Every change of what the watch stated, and at the end the last evaluation if it differs."""
     steps: list[ModeStep] = []
     for report in reports:
         before = steps[-1] if steps else None

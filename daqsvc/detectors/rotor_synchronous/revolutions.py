@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 SpeedReference: TypeAlias = KeyphasorProbe | Literal["fixed", "orbit"]
-"""What tells the shaft angle: a keyphasor, the stated speed, or the orbit's own 1X around it."""
+"""What gives the shaft angle: a keyphasor, the stated speed, or the orbit's own 1X around it."""
 
 _MIN_PROBE_SPREAD = 0.5
 """Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
@@ -35,7 +35,7 @@ class Revolution:
     """One revolution of the shaft.
 
     Attributes:
-        raw: float64 ``[n, 2]``, what the probes say, in um; NaN where missing.
+        raw: float64 ``[n, 2]``, what the probes measure, in um; NaN where missing.
         orbit: the revolution alone, in um along x and y. Its angle goes on through the mark where the
             revolution does not begin at the mark.
         vector: its synchronous vector; the end is counted from the first sample of the stream.
@@ -79,7 +79,7 @@ class RevolutionStream:
         rate_hz: sampling rate.
         speed_rpm: stated speed; negative if the shaft turns clockwise.
         probes: two proximity probes.
-        reference: what tells the shaft angle.
+        reference: what gives the shaft angle.
 
     Raises:
         ValueError: a figure cannot be, or the probes look in nearly the same direction.

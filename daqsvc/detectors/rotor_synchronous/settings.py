@@ -58,7 +58,7 @@ class RotorSynchronous(Section):
 
     @property
     def reference(self) -> SpeedSource:
-        """What tells the shaft angle, said or implied."""
+        """What gives the shaft angle, stated or implied."""
         if self.speed_source is not None:
             return self.speed_source
         return "fixed" if self.keyphasor is None else "keyphasor"

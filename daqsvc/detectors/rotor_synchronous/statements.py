@@ -1,4 +1,4 @@
-"""What the watch of a calibrated rotor reports, as diagnoses: when it is worth saying, and in which words."""
+"""What the watch of a calibrated rotor reports, as diagnoses: when, and in which words."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Standing:
 
 
 class Stater:
-    """Turns standings into diagnoses, at most one a revolution, and remembers what was said.
+    """Turns standings into diagnoses, at most one a revolution, and remembers what was stated.
 
     Args:
         machine: name of the machine.
@@ -122,7 +122,7 @@ class Stater:
     def maybe(
         self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int
     ) -> Diagnosis | None:
-        """The statement after a revolution, if there is something to say.
+        """The statement after a revolution, if there is something to state.
 
         Args:
             standing: the present state.
@@ -159,7 +159,7 @@ class Stater:
         )  # fmt: skip
 
     def silence(self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int) -> Diagnosis:
-        """A statement that holds what was said last and changes nothing; arguments as of `maybe`."""
+        """A statement that holds what was stated last and changes nothing; arguments as of `maybe`."""
         return self._diagnosis(
             standing, verdict, first_index=end_index, end_index=end_index, t_ns=t_ns, changed=False
         )

@@ -219,7 +219,7 @@ class RotorAlarm:
 
 @dataclass(frozen=True, slots=True)
 class ModeStep:
-    """A change of what is said about the machine, at the end of a revolution.
+    """A change of what is stated about the machine, at the end of a revolution.
 
     Attributes:
         revolution: the revolution.
@@ -282,7 +282,7 @@ class RotorVerdict(Verdict):
         reference_revolutions: healthy revolutions that the baseline has grown to.
         speed_rpm: mean shaft speed, negative if clockwise; None if not known.
         revolutions: whole revolutions in the recording.
-        history: every change of what was said.
+        history: every change of what was stated.
         trace: what it was made of; None if refused before.
     """
 

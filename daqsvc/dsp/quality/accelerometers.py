@@ -1,7 +1,7 @@
 """Whether the channel of an accelerometer is fit for the tests of a bearing; put right where that is honest.
 
 Missing samples and drop-outs are bridged, wrong samples and steps taken out, transients faded out, a
-wandering mean followed. Each repair is said, with its place. A channel without defects comes back as it is.
+wandering mean followed. Each repair is reported, with its place. A channel without defects stays as it is.
 """
 
 from __future__ import annotations

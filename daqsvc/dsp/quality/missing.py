@@ -91,7 +91,7 @@ def lacking(name: str, signal: Floats, effect: str = "") -> str:
     Args:
         name: of the sensor.
         signal: float64 ``[n]``, NaN where missing.
-        effect: what that entails, to be said with it.
+        effect: what that entails, to be stated with it.
 
     Returns:
         Empty if no more than `ACCELEROMETER_SHARE` of them are missing.

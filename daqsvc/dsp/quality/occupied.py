@@ -31,7 +31,7 @@ order and more) or upsampled, the same fell by 29 dB and more."""
 
 
 def occupied_top_hz(samples: Real, rate_hz: float) -> float | None:
-    """Where a record ends in frequency; None where it reaches up to half its rate, or is too short to tell.
+    """Where a record ends in frequency; None where it reaches up to half its rate, or is too short.
 
     Args:
         samples: ``[n]``, finite.

@@ -101,7 +101,7 @@ class RevolutionJudge:
         """What a revolution is worth.
 
         Args:
-            samples: float64 ``[n, 2]``, micrometres, as the probes say it; NaN where missing.
+            samples: float64 ``[n, 2]``, micrometres, as the probes measure it; NaN where missing.
             least_motion_um: standard deviation that each probe must show at least.
         """
         whole = within_some_unit(samples)

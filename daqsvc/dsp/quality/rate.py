@@ -1,8 +1,8 @@
-"""Whether samples come at the rate that they are said to: by when frames arrive, or by a recording's stamps.
+"""Whether samples come at the rate that is stated: by when frames arrive, or by a recording's stamps.
 
 Live, fewer frames than expected come of a device that is slower, and of a link that loses some. What a slower
 device sends is regular; what is lost leaves gaps at random. The same holds for more frames than expected, and
-a link that repeats some. Where no counter tells how many are missing, `ArrivalRate` tells them apart.
+a link that repeats some. Where no counter shows how many are missing, `ArrivalRate` tells them apart.
 
 A recording states a rate, or has a column of time (`rate_of_stamps`). The two must agree ten times closer
 than arrivals do with the nominal rate: stamps are rounded, arrivals have the jitter of link and computer.
@@ -75,7 +75,7 @@ MOST_BINS = 512
 
 @dataclass(frozen=True, slots=True)
 class StampedRate:
-    """What the stamps of a recording say.
+    """What the stamps of a recording show.
 
     Attributes:
         rate_hz: samples per second.
@@ -92,16 +92,16 @@ class StampedRate:
     backward: int = 0
 
     def agrees(self, hz: float) -> bool:
-        """Whether a rate is that of the stamps, as far as their digits tell."""
+        """Whether a rate is that of the stamps, as far as their digits show."""
         return abs(self.rate_hz / hz - 1.0) <= SAME_RATE + self.tolerance
 
 
 def rate_of_stamps(seconds: Floats, *, surely_time: bool) -> StampedRate | None:
-    """The rate that the stamps of samples say, and where samples lack between them; None if they say nothing.
+    """The rate that the stamps of samples show, and where samples lack between them; None if they show none.
 
     Args:
         seconds: float64 ``[n]``, n at least 3; what is not finite is missing.
-        surely_time: whether they are said to be stamps; else only even steps make them some.
+        surely_time: whether they are stated to be stamps; else only even steps make them some.
     """
     with np.errstate(invalid="ignore"):  # infinities make NaN
         steps = np.diff(seconds)
@@ -175,7 +175,7 @@ def _follow(seconds: Floats, fits: NDArray[np.bool_], period: float) -> Floats:
 
 
 def _mean_rate(seconds: Floats) -> StampedRate | None:
-    """What stamps that are coarse, or lack some, say all the same; None if they go back often."""
+    """What stamps that are coarse, or lack some, show all the same; None if they go back often."""
     there = np.flatnonzero(np.isfinite(seconds))
     steps = np.diff(seconds[there])
     if len(there) < 2 or steps.max() <= 0.0:

@@ -47,7 +47,7 @@ OFF_STATED = 0.015
 
 
 def off_stated_speed(seen_rpm: float, stated_rpm: float) -> str:
-    """What to say of a speed by the harmonics of the shaft that is not the stated one; empty if it is.
+    """The note about a speed by the harmonics of the shaft that is not the stated one; empty if it is.
 
     Args:
         seen_rpm: by harmonics that stand out clearly.
@@ -243,7 +243,7 @@ def refuse_stuck(
         period_samples: samples per revolution.
 
     Returns:
-        The quality with the clipped samples counted, and told if they are few.
+        The quality with the clipped samples counted, and reported if they are few.
 
     Raises:
         UnfitError: a probe repeats one value through whole revolutions, or is clipped in some.
@@ -337,7 +337,7 @@ class Complaint:
 
     Attributes:
         reason: in its words, of the first time.
-        times: how often it said so.
+        times: how often it was so.
     """
 
     reason: str

@@ -1,4 +1,4 @@
-"""Units of recordings, and whether samples can be in the one that they are said to be in, by their size.
+"""Units of recordings, and whether samples can be in the one that is stated, by their size.
 
 This is asked of recordings only. Live, a sensor's unit is in the machine file, where `daqsvc check` shows
 what becomes of it, and a machine that stands still is as quiet as one in a wrong unit. What no sensor
@@ -35,7 +35,7 @@ AccelerationUnit = Literal["g", "m/s2", "mg", "mm/s2", "V"]
 ACCELERATION_UNITS: tuple[AccelerationUnit, ...] = get_args(AccelerationUnit)
 
 M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0, "mg": 9.80665e-3, "mm/s2": 1e-3}
-"""Of standard gravity (CGPM 1901). Volts are missing: what they mean only the sensor's sensitivity tells."""
+"""Of standard gravity (CGPM 1901). Volts are missing: what they mean only the sensor's sensitivity shows."""
 
 _USUAL_G = (1e-3, 50.0)
 """R.m.s. of a housing on a running machine, at the least and at most."""
@@ -83,7 +83,7 @@ def beyond_any_unit(signal: NDArray[np.floating]) -> str:
     Args:
         signal: ``[n]``; what is not finite does not count.
     """
-    # It costs a third of what states where, and leaves nothing to say of nearly every signal.
+    # It costs a third of what states where, and leaves nothing to report of nearly every signal.
     if within_some_unit(signal):
         return ""
     far = (signal > MOST_IN_ANY_UNIT) | (signal < -MOST_IN_ANY_UNIT)
@@ -151,7 +151,7 @@ def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
     Args:
         samples: float64 ``[n, 2]`` in um, NaN where missing.
         clearance_um: radial clearance, if known.
-        unit: what the samples were said to be in.
+        unit: the stated unit of the samples.
 
     Raises:
         UnfitError: the orbit is too small or too large.
@@ -175,7 +175,7 @@ def doubt_size(quality: DataQuality, samples: Floats, clearance_um: float | None
         quality: what is known so far.
         samples: float64 ``[n, 2]`` in um, NaN where missing.
         clearance_um: radial clearance, if known.
-        unit: what the samples were said to be in.
+        unit: the stated unit of the samples.
     """
     radius_um = _radius_um(samples)
     if clearance_um is None or radius_um >= _LEAST_OF_CLEARANCE * clearance_um:
@@ -197,7 +197,7 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
     Args:
         names: of the channels.
         samples: float64 ``[n, channels]`` as they were recorded.
-        unit: that they are said to be in.
+        unit: their stated unit.
     """
     quality = count_bad(names, samples)
     for name, column in zip(names, samples.T, strict=True):
@@ -216,12 +216,12 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
 
 
 def unit_problems(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> Iterator[str]:
-    """What to say of accelerometers that are possible, but quiet or loud for a running machine.
+    """The note about accelerometers that are possible, but quiet or loud for a running machine.
 
     Args:
         names: of the channels.
         samples: float64 ``[n, channels]`` as they were recorded.
-        unit: that they are said to be in.
+        unit: their stated unit.
     """
     for name, column in zip(names, samples.T, strict=True):
         rms, _ = _spread(column)
@@ -263,7 +263,7 @@ def refuse_no_machine(samples: Floats, unit: AccelerationUnit, *, seen: bool) ->
 
     Args:
         samples: ``[n]``, as they were recorded.
-        unit: that they are said to be in.
+        unit: their stated unit.
         seen: whether damage, or harmonics of a shaft, stand out.
 
     Raises:

@@ -153,7 +153,7 @@ SEEN_NATS = 7.0
 NOT_MAINS_NATS = 3.5
 """Votes of them that must not be at multiples of the mains' frequency: about one clear harmonic."""
 SAME = 0.004
-"""Speeds as near as this are one, as sharply as lines tell."""
+"""Speeds as near as this are one, as sharply as lines show."""
 NEAR = 0.03
 """A speed as near to the stated one as this may be the same, misstated."""
 NEAR_NATS = 6.0
@@ -232,7 +232,7 @@ def shaft_rate(
     """Refine a stated shaft rate by the harmonics of the shaft in a signal and in its envelope.
 
     The lines of 1X to 3X decide where they stand out (`find_speed`); otherwise eight harmonics vote, each
-    with a limited voice. The votes also tell whether the speed is confirmed: it must have more of them than
+    with a limited voice. The votes also show whether the speed is confirmed: it must have more of them than
     any other from half to twice the stated one.
 
     Args:

@@ -1,4 +1,4 @@
-"""Speed, sense of rotation and shaft angle from the orbit's own 1X, where no keyphasor tells them.
+"""Speed, sense of rotation and shaft angle from the orbit's own 1X, where no keyphasor shows them.
 
 With two probes at right angles, z = x + i y turns with the shaft. Its full spectrum has the 1X line at plus
 the rotational frequency for a forward orbit and at minus it for a backward one. An ellipse has both.
@@ -33,7 +33,7 @@ _ORDERS = (1, -1, 0, 2, -2, 3, -3)
 _LINE_OVER_NOISE = 25.0
 """Power of both 1X lines over the noise in one bin, below which there is no line: by chance, 1 in 10^6."""
 _UNDECIDED = 0.05
-"""Forward and backward amplitudes that differ by less of the larger one do not tell the sense."""
+"""Forward and backward amplitudes that differ by less of the larger one do not show the sense."""
 
 AT_THE_EDGE = 0.08
 """A line so far from the stated speed, of the tenth that is searched, may be the flank of another one."""
@@ -64,7 +64,7 @@ class SpeedEstimate:
         uncertainty_rpm: its standard deviation.
         direction: ``"forward"`` if the orbit turns with the stated speed (anticlockwise, from +x to +y,
             for a positive one or none), ``"backward"`` if against it: reversed rotation or swapped probes,
-            ``"straight"`` if the orbit is too flat to tell.
+            ``"straight"`` if the orbit is too flat to show it.
     """
 
     speed_rpm: float
@@ -138,7 +138,7 @@ def refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm
         healthy = first[: math.ceil(turns * 60.0 * rate_hz / strongest_rpm)]
         strongest_rpm = estimate_speed(healthy, rate_hz, strongest_rpm).speed_rpm
     except ValueError:
-        return  # no line anywhere: the search near the stated speed has said so
+        return  # no line anywhere: the search near the stated speed has reported it
     if abs(strongest_rpm / abs(stated_rpm) - 1.0) <= AT_THE_EDGE:
         return
     if found_rpm is None:

@@ -6,7 +6,7 @@ last a non-integer number of samples; a sample belongs to the revolution that it
 
 A pulse with flanks shorter than the sampling interval states only between which two samples its edge lies.
 Half way between them is wrong by up to half a sample, 3 degrees at 64 samples a revolution, and jumps by a
-whole one from one revolution to another. The last edges together say more: of all constant speeds that put
+whole one from one revolution to another. The last edges together show more: of all constant speeds that put
 each of them between its own two samples, the middle one places the newest (`SteadyEdges`).
 """
 
@@ -42,7 +42,7 @@ _PULL = 0.1
 
 
 class SharpEdges:
-    """Tells which edges of a signal are sharp, block by block."""
+    """Finds which edges of a signal are sharp, block by block."""
 
     def __init__(self) -> None:
         self.reset()

@@ -24,7 +24,7 @@ _MOST_ODD = 0.2
 
 
 class SpeedError(ValueError):
-    """The pulses of an evaluation tell no speed; the message states why and what to do."""
+    """The pulses of an evaluation show no speed; the message states why and what to do."""
 
 
 class ShaftSpeed(NamedTuple):

@@ -65,7 +65,7 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
     Raises:
         RecordingError: there is no such file, or none that can be read.
     """
-    # Asked first, as the readers say it in their own words.
+    # Asked first, as the readers report it in their own words.
     try:
         status = path.stat()
     except FileNotFoundError:
@@ -101,7 +101,7 @@ def read(path: Path, limits: ResourceLimits, wanted: Collection[str] | None = No
         path: the file.
         limits: of reading it.
         wanted: the channels whose samples are examined; None: all. Of others, where they are too large,
-            some formats tell the length only.
+            some formats state the length only.
 
     Raises:
         RecordingError: the file cannot be read.

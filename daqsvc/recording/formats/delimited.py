@@ -126,10 +126,10 @@ class _DelimitedTable:
         return replace(contents, elsewhere=_by_short_names(contents))
 
     def _take_units(self, names: Sequence[str]) -> dict[str, str]:
-        """The units of the columns by their names, as the names, a row of units or comments say.
+        """The units of the columns by their names, as the names, a row of units or comments state.
 
         Raises:
-            RecordingError: two of these are said of a column.
+            RecordingError: two of these are stated of a column.
         """
         units: dict[str, str] = {}
         for i, name in enumerate(names):
@@ -214,7 +214,7 @@ class _DelimitedTable:
         """The times of a column by its number.
 
         Raises:
-            RecordingError: nothing tells the day from the month.
+            RecordingError: nothing separates the day from the month.
         """
         forms = self._layout.times
         form = forms[i]
@@ -309,7 +309,7 @@ class _DelimitedTable:
             self._stated.setdefault(stated[1], float(stated[2]))
 
     def _find_fault(self) -> None:
-        """Say which cell is no number, by its line and column in the file, both counted from 1.
+        """State which cell is no number, by its line and column in the file, both counted from 1.
 
         Raises:
             RecordingError: there is one, or a line is too short.
@@ -403,7 +403,7 @@ class TextFile:
         with self._open() as file:
             mark = file.read(2)
             if self._zipped and _declared_bytes(path) > budget.most_bytes:
-                # Said at the end of the file, which is anything where that is cut off: so count.
+                # Reported at the end of the file, which is anything where that is cut off: so count.
                 counted = CountedFile(file, replace(budget))
                 while counted.read(_BUFFER_BYTES):
                     pass

@@ -1,4 +1,4 @@
-"""How the first lines of a text table say that it is laid out: delimiter, decimal point, preamble, header."""
+"""How a text table is laid out by its first lines: delimiter, decimal point, preamble, header."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def _width(rows: Sequence[Sequence[str]]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Heading:
-    """Which lines above a table say what its columns are.
+    """Which lines above a table state what its columns are.
 
     Attributes:
         names: number of the line that names them; None if none does.

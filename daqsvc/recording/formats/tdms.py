@@ -66,7 +66,7 @@ def read_tdms(path: Path, budget: Budget) -> Contents:
 
 
 def _check_segments(path: Path, file_bytes: int) -> None:
-    """See whether the segments are as long as they say, as nptdms takes what is cut short for the whole.
+    """See whether the segments are as long as they state, as nptdms takes what is cut short for the whole.
 
     Raises:
         RecordingError: they are not.

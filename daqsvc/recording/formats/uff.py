@@ -125,7 +125,7 @@ def _without_abscissa(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def _rate(one: Mapping[str, Any]) -> float:
-    """Samples per second by the abscissa, or what is said of them elsewhere where that agrees with it."""
+    """Samples per second by the abscissa, or what is stated of them elsewhere where that agrees with it."""
     rate_hz = rate_of_step(float(one["abscissa_inc"]), _STEP_DIGITS)
     exact = EXACT.fullmatch(_text(one.get("id4")))
     try:

@@ -125,7 +125,7 @@ def times_of(cells: Sequence[str], form: TimeFormat) -> WrittenTimes:
 
 
 class EitherDateError(ValueError):
-    """Nothing tells which of two numbers is the day and which is the month."""
+    """Nothing shows which of two numbers is the day and which is the month."""
 
 
 class ColumnTimes(NamedTuple):
@@ -150,7 +150,7 @@ def joined_times(pieces: Sequence[WrittenTimes], form: TimeFormat, length: int) 
         length: rows of the table.
 
     Raises:
-        EitherDateError: day and month can be meant both ways, and the rows tell neither.
+        EitherDateError: day and month can be meant both ways, and the rows show neither.
     """
     times = np.concatenate([piece.times for piece in pieces])[:length]
     others = [piece.others for piece in pieces if piece.others is not None]

@@ -47,8 +47,8 @@ class Writer:
     """How a format is written.
 
     Attributes:
-        write: writes streams to a file that does not exist yet, with what is said about all of them; returns
-            what the file cannot hold, in sentences.
+        write: writes streams to a file that does not exist yet, with what is stated about all of them;
+            returns what the file cannot hold, in sentences.
         several: whether a file holds several streams; else it is called with one.
         library: the module that it needs beside what every installation has; empty if none.
         extra: what brings that.
@@ -141,7 +141,7 @@ def write_all(
 
     Args:
         files: by path, the streams of each; all in one folder.
-        about: what is said in each file: names of the fields, and their texts.
+        about: what is stated in each file: names of the fields, and their texts.
         force: replace what is there.
 
     Returns:

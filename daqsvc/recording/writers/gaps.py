@@ -1,4 +1,4 @@
-"""What files have no way to say: missing samples, infinite ones, and two columns of one name."""
+"""What files have no way to state: missing samples, infinite ones, and two columns of one name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def filled(samples: NDArray[np.floating], kind: type[np.floating]) -> tuple[NDAr
 def notes_on_gaps(
     path: Path, streams: Sequence[RecordedStream], format_name: str, infinite: Sequence[int]
 ) -> list[str]:
-    """What to say of values that are filled, a sentence for each stream and reason.
+    """The notes about values that are filled, a sentence for each stream and reason.
 
     Args:
         path: the file.

@@ -117,7 +117,7 @@ def _names(names: Sequence[str]) -> list[str]:
 
 
 def _notes_on_texts(path: Path, name: str, line: str, unit: str, label: str) -> list[str]:
-    """What a header does not say as the recording does; a unit in other letters is the same unit."""
+    """What a header does not state as the recording does; a unit in other letters is the same unit."""
     notes = []
     if line != name:
         notes.append(f"{path.name}: channel {name} is called {line} there, as a UFF file has ASCII names")

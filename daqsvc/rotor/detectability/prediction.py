@@ -328,7 +328,7 @@ class Ambiguity:
     Attributes:
         modes: their names.
         nats_per_rev: the weaker of the two directions of evidence.
-        opens_at_w: nearest normalised speed within 30 % that tells them apart; None if there is none, or
+        opens_at_w: nearest normalised speed within 30 % that separates them; None if there is none, or
             if one of them rubs and no other speed was simulated.
         open_nats_per_rev: the weaker direction there.
         by_steady_1x: whether a bank from a run-up sees the one in its steady 1X, as a change from the other,

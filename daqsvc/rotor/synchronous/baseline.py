@@ -331,7 +331,7 @@ def _refuse_unsteady(
     *,
     assumed: bool,
 ) -> None:
-    """Whether any stretch of the revolutions differs from the others; if so, say how.
+    """Whether any stretch of the revolutions differs from the others; if so, state how.
 
     Args:
         moved: complex128 ``[R, 5]``, vectors brought to one speed.
