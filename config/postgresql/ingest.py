@@ -120,7 +120,7 @@ def _time(document: Any) -> str:
     """When it was.
 
     Raises:
-        KeyError, TypeError, ValueError: it does not say so as daqsvc does.
+        KeyError, TypeError, ValueError: it does not state it as daqsvc does.
     """
     text = _text(document, "time")
     if not TIME.fullmatch(text):
@@ -211,7 +211,7 @@ class Ingester:
         self._client.on_message = self._on_message
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Go on until told to stop; what is not committed by then comes again."""
+        """Go on until stopped; what is not committed by then comes again."""
         kept = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no type for it
         kept.SessionExpiryInterval, kept.ReceiveMaximum = SESSION_S, UNDER_WAY
         self._client.connect_async(
@@ -266,7 +266,7 @@ class Ingester:
         return f"{self._options.broker}:{self._options.port}"
 
     def _is_away(self, why: str, code: str = "O09", *, is_news: bool = False) -> None:
-        """Say so once, however often it is tried; and once more if the reason is news."""
+        """Log it once, however often it is tried; and once more if the reason is news."""
         if not self._why_away or (is_news and why not in self._why_away):
             log.warning("the broker %s is away, and is tried again: %s [%s]", self._broker, why, code)
         self._why_away.add(why)

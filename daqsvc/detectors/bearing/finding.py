@@ -1,7 +1,7 @@
 """From the bearings of a machine, each judged by itself, to one statement about the machine.
 
 A fault is heard at the far bearing, too: the bearing that shows most is the faulty one. That the machine has
-changed at all is decided by the innovations of its healthy model, where there is one, and for the residual of
+changed at all is decided by the innovations of its healthy model, where there is one, and by the residual of
 two accelerometers, where a bearing has them.
 
 Lines and direction join so. Lines that stand out name a part by themselves. The direction settles which race
