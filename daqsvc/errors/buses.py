@@ -110,7 +110,8 @@ BUS_TOO_SLOW = Code(
 NO_SUCH_INTERFACE = Code(
     "B11",
     "The interface of CAN is not known",
-    "python-can has no interface of this name, or the package that brings it is not installed.",
+    "python-can has no interface of this name, or the package that brings it is not installed. Or the "
+    "channel is no name that Linux gives to a CAN interface.",
     "Correct the name, or install the plugin of python-can for the device.",
     _PAGE,
     example='machine.toml:33: buses.can0.interface = "socketcn": python-can knows no such interface. Remedy: '

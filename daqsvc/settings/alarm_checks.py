@@ -220,6 +220,7 @@ def _setpoint_checks(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> I
     yield _deadband(alarm, at)
     yield _sensors(draft, alarm, at)
     yield _believed(draft, alarm, at)
+    yield _believed_at_start_up(draft, alarm, at)
     yield _measured(draft, alarm, at)
     yield _trip_multiply(draft, alarm, at)
 
@@ -434,8 +435,7 @@ def _believed(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
     """Whether the setpoints can be reached, and left, while the sensors are believed."""
     if alarm.measure not in _TWO_SIDED:
         return
-    sensors, grows = _named(draft), alarm.trip_multiply
-    uppers = [value for key, value in alarm.setpoints.items() if key in _UPPER]
+    sensors = _named(draft)
     for name in alarm.watched:
         sensor = sensors.get(name)
         key, limits = _ok_limits(sensor)
@@ -450,19 +450,37 @@ def _believed(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
                     f"correct it, or {key} of the sensor",
                     code=NEVER_REACHED,
                 )
-            elif setpoint in _UPPER and all(upper > 0 for upper in uppers) and value * grows > limits[1]:
-                yield Finding(
-                    (*at, "trip_multiply"),
-                    f"has {setpoint} = {value:g} wait for {value * grows:g} at a start-up, which "
-                    f"is never reached: it lies outside {limits_text}, where that is not believed",
-                    f"make it at most {math.floor(10.0 * limits[1] / value) / 10.0:g}, or correct {key} of "
-                    "the sensor",
-                    code=NEVER_REACHED,
-                )
             room = value - limits[0] if setpoint in _UPPER else limits[1] - value
             if 0 < room <= alarm.deadband:
                 yield _never_returns(at, f"the {room:g} that {limits_text} leave beside {setpoint}", room)
                 return
+
+
+def _believed_at_start_up(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
+    """Whether the largest setpoint times trip_multiply can be reached while the sensors are believed."""
+    upper = {value: key for key, value in alarm.setpoints.items() if key in _UPPER}
+    if alarm.measure not in _TWO_SIDED or alarm.trip_multiply <= 1 or min(upper, default=0.0) <= 0:
+        return
+    largest = max(upper)
+    reached = largest * alarm.trip_multiply
+    sensors = _named(draft)
+    ends = [
+        (limits[1], key, name)
+        for name in alarm.watched
+        for key, limits in (_ok_limits(sensors.get(name)),)
+        if limits is not None
+    ]
+    end, key, name = min(ends, default=(math.inf, "", ""))
+    if largest <= end < reached:
+        most = math.floor(10.0 * end / largest) / 10.0
+        yield Finding(
+            (*at, "trip_multiply"),
+            f"has {upper[largest]} = {largest:g} wait for {reached:g} at a start-up, which is never reached: "
+            f'the OK limits of "{name}" end at {end:g}',
+            f"{f'make it at most {most:g}' if most > 1 else 'remove it'}, or have {key} of the sensor end "
+            f"beyond {reached:g}",
+            code=NEVER_REACHED,
+        )
 
 
 def _ok_limits(sensor: Sensor | None) -> tuple[str, tuple[float, float] | None]:

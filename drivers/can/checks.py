@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, get_args
@@ -41,6 +42,9 @@ LEAST_COUNTER_BITS = 4
 
 PRIORITY = 0x1C00_0000
 """Bits of a J1939 id that state how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
+
+_OF_LINUX = re.compile(r"[^/\s]{1,15}").fullmatch
+"""Names that a network interface can have (IFNAMSIZ in linux/if.h)."""
 
 
 class FrameFacts(NamedTuple):
@@ -283,6 +287,14 @@ def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
                     ("buses", name, "interface"),
                     "python-can knows no such interface",
                     f"{choice(bus.interface, BACKENDS)}; or install the python-can plugin that brings it",
+                    code=NO_SUCH_INTERFACE,
+                )
+            elif isinstance(bus, CanBus) and bus.interface == "socketcan" and not _OF_LINUX(bus.channel):
+                yield Finding(
+                    ("buses", name, "channel"),
+                    "is no name of a CAN interface of Linux: these have at most 15 characters and no /",
+                    'write e.g. channel = "can0" (`ip link` lists them); for a bus between programs, write '
+                    'interface = "unixbus"',
                     code=NO_SUCH_INTERFACE,
                 )
             elif isinstance(bus, CanBus) and bus.interface == "socketcan" and bus.options:

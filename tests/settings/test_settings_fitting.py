@@ -91,6 +91,16 @@ FITTING = [
         "knows no such interface",
         'did you mean "socketcan"',
     ),
+    *(
+        (
+            LAVAL,
+            [('channel = "can0"', f'channel = "{channel}"')],
+            "buses.can0.channel",
+            "is no name of a CAN interface of Linux",
+            'write interface = "unixbus"',
+        )
+        for channel in ("run/bus", "an-interface-of-the-box")
+    ),
     (LAVAL, [('bus = "can0"', 'bus = "can1"')], "streams.shaft.bus", "no such bus", 'did you mean "can0"'),
     (LAVAL, [('stream = "shaft"', 'stream = "shft"')], "sensors[0].stream", "no such stream", '"shaft"'),
     (

@@ -472,7 +472,8 @@ def test_samples_too_slow_for_1x_are_warned_of_once():
 def test_too_short_a_window_of_slow_samples_may_be_one_of_levels():
     problem, _ = only_problem(MOTOR, ("12_000.0", "10.0"), (BAND, ""))
     assert problem.key == "pipeline.levels.window_s"
-    assert 'or type = "trend" for sensors whose level the device measures itself' in problem.remedy
+    assert problem.remedy.startswith("have the device send 76.7 samples a second or more; or, if the device ")
+    assert 'write type = "trend" for the sensor' in problem.remedy
 
 
 @pytest.mark.parametrize(

@@ -384,7 +384,10 @@ def test_a_start_up_may_not_take_a_limit_beyond_the_ok_limits():
     (problem,) = problems_of(text, PUMP)
     assert (f"{problem.code}", problem.key) == ("A06", "alarms[0].trip_multiply")
     assert "has danger = 4.5 wait for 9 at a start-up, which is never reached" in problem.message
-    assert "make it at most 1.9" in problem.remedy
+    assert problem.remedy == "make it at most 1.9, or have ok_between of the sensor end beyond 9"
+    text, _ = changed(PUMP, *starting_up((OK, "ok_between = [0.0, 4.6]")))
+    (problem,) = problems_of(text, PUMP)
+    assert problem.remedy == "remove it, or have ok_between of the sensor end beyond 9"
     assert not parsed(PUMP, *starting_up((OK, "ok_between = [0.0, 9.0]"))).warnings
 
 

@@ -334,11 +334,23 @@ def _speed_in_samples(draft: MachineFile) -> Iterator[Finding]:
                 ("streams", stream, "rate_hz"),
                 f"shows nothing above {rate_hz / 2:g} Hz, and the machine turns at {once_hz:.4g} Hz "
                 f"({speed_rpm:g} rpm). RMS and peak of {', '.join(moving)} do not show its vibration",
-                f"have the device send {rounded_up(SAMPLES_PER_PERIOD * once_hz)} samples a second or more; "
-                f"or, {_IF_A_LEVEL}",
+                show_1x(once_hz),
                 fatal=False,
                 code=SAMPLED_TOO_SLOWLY,
             )
+
+
+def is_below_1x(draft: MachineFile, stream: str) -> bool:
+    """Whether the samples of a stream are too slow to show 1X of the machine."""
+    with suppress(UnusableValueError):
+        return draft.streams[stream].rate_hz < 2.0 * abs(draft.machine.speed_rpm) / 60.0
+    return False
+
+
+def show_1x(once_hz: float) -> str:
+    """The remedy where samples are too slow for that."""
+    needed = rounded_up(SAMPLES_PER_PERIOD * once_hz)
+    return f"have the device send {needed} samples a second or more; or, {_IF_A_LEVEL}"
 
 
 def _remedy_for_1x(

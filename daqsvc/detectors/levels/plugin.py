@@ -6,11 +6,10 @@ And whether their settings fit the streams and sensors.
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.detectors.levels.measure_checks import measure_checks
+from daqsvc.detectors.levels.measure_checks import is_below_1x, measure_checks, show_1x
 from daqsvc.detectors.levels.settings import Levels
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import STALE_S, Reading
@@ -308,7 +307,7 @@ def _window(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         yield Finding(
             at,
             f"{window_s:g} s at {slowest_hz:g} Hz are fewer than {_LEAST_WINDOW_SAMPLES} samples",
-            remedy + _if_no_waveform(draft, name),
+            _remedy(draft, name, remedy),
             code=WINDOW_TOO_SHORT,
         )
     if ring_s < _RING_WINDOWS * window_s:
@@ -349,7 +348,7 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
                 at,
                 f"the band {low_hz:g} Hz to {high_hz:g} Hz must end below {rate_hz / 2:g} Hz, half the rate "
                 f'of stream "{sensor.stream}" (sensor "{sensor.name}")',
-                remedy + _if_no_waveform(draft, sensor.stream),
+                _remedy(draft, sensor.stream, remedy),
                 code=BAND_TOO_HIGH,
             )
             return
@@ -378,6 +377,7 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         for name in streams
         if name in draft.streams
         and levels.band_hz(draft.streams[name].rate_hz, draft.machine.speed_rpm) is not None
+        and not is_below_1x(draft, name)  # a warning of that shows what to do
     }
     for name, block in blocks.items():
         if block is None:
@@ -407,10 +407,16 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         )
 
 
-def _if_no_waveform(draft: MachineFile, stream: str) -> str:
-    """What else to do about a stream that is too slow for waveforms: it is polled, or does not show 1X."""
-    table = draft.streams[stream]
-    slow = table.layout.polled
-    with suppress(UnusableValueError):
-        slow = slow or table.rate_hz < 2.0 * abs(draft.machine.speed_rpm) / 60.0
-    return ', or type = "trend" for sensors whose level the device measures itself' if slow else ""
+def _remedy(draft: MachineFile, stream: str, of_waveforms: str) -> str:
+    """What to do about a stream that is too slow, also where it is polled, or does not show 1X.
+
+    Args:
+        draft: the machine file, or what is valid of it.
+        stream: its name.
+        of_waveforms: what to do where samples are those of a motion.
+    """
+    if draft.streams[stream].layout.polled:
+        return f'{of_waveforms}, or type = "trend" for sensors whose level the device measures itself'
+    if is_below_1x(draft, stream):
+        return show_1x(abs(draft.machine.speed_rpm) / 60.0)
+    return of_waveforms
