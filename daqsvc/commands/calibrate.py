@@ -147,7 +147,7 @@ class CalibrateCommand(VerbWithKernels):
         return calibrate_recordings(
             _with_notes_printed(loaded),
             rotor.setup,
-            rotor_given=machine is not None or arguments.natural_frequency_hz is not None,
+            rotor_is_known=machine is not None or arguments.natural_frequency_hz is not None,
             sweep_rpm=arguments.sweep_rpm,
         )
 

@@ -272,23 +272,23 @@ def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines 
         twice_hz, reach_hz = 2.0 * line_hz, 2.0 * line_hz * _GRID_SHARE
         if lines.level_db(twice_hz, reach_hz) < _LINE_DB:
             continue
-        found_hz = lines.strongest_hz(twice_hz, reach_hz)
-        if lines.narrow_db(found_hz, skirt_share=0.5) < _LINE_DB:
+        peak_hz = lines.strongest_hz(twice_hz, reach_hz)
+        if lines.narrow_db(peak_hz, skirt_share=0.5) < _LINE_DB:
             continue  # smeared, as slip smears a bearing's
-        order = found_hz / shaft_hz
+        order = peak_hz / shaft_hz
         beside_hz = abs(order - round(order)) * shaft_hz
-        if abs(found_hz - twice_hz) > reach_hz or beside_hz < max(2.0 * lines.step_hz, known * found_hz):
+        if abs(peak_hz - twice_hz) > reach_hz or beside_hz < max(2.0 * lines.step_hz, known * peak_hz):
             continue  # a harmonic of the shaft, or of something else
         for pairs in range(1, _MOST_POLE_PAIRS + 1):
-            synchronous_hz = 0.5 * found_hz / pairs
+            synchronous_hz = 0.5 * peak_hz / pairs
             slip_hz = synchronous_hz - shaft_hz
             if not 0.0 < slip_hz < _MOST_SLIP * synchronous_hz:
                 continue
             spacing = 2.0 * pairs * slip_hz / shaft_hz
             shows = spacing * shaft_hz > 3.0 * lines.step_hz and any(
                 min(lines.level_db(carrier_hz + side * spacing * shaft_hz) for side in (-1, 1)) > _SIDEBAND_DB
-                for carrier_hz in (shaft_hz, found_hz)
+                for carrier_hz in (shaft_hz, peak_hz)
             )
-            return DriveLines("motor", found_hz, order, spacing=spacing if shows else None, poles=2 * pairs)
-        return DriveLines("motor", found_hz, order)
+            return DriveLines("motor", peak_hz, order, spacing=spacing if shows else None, poles=2 * pairs)
+        return DriveLines("motor", peak_hz, order)
     return None

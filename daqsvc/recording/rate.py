@@ -170,7 +170,7 @@ def place_at(
         channels: the channels themselves, by their names in the file.
 
     Returns:
-        As `Timing.rows` and `Timing.notes`. Nothing is said to be missing by a column of time that tells
+        As `Timing.rows` and `Timing.notes`. Nothing is reported missing by a column of time that shows
         another rate.
 
     Raises:

@@ -314,9 +314,9 @@ class Stamps(NamedTuple):
     """What the kernel reports about received datagrams.
 
     Attributes:
-        software_ns: int64 ``[n]``, when the kernel took each in, on CLOCK_REALTIME; 0 where it does not say.
-        hardware_ns: int64 ``[n]``, when the controller took each in, on its own clock; 0 where it does
-            not say.
+        software_ns: int64 ``[n]``, when the kernel took each in, on CLOCK_REALTIME; 0 if not stated.
+        hardware_ns: int64 ``[n]``, when the controller took each in, on its own clock; 0 if not
+            stated.
         dropped: how many datagrams the kernel had dropped on this socket before the last one, modulo 2^32;
             None if it does not state it, which means none as long as it never did.
     """

@@ -72,7 +72,7 @@ class Framing(Protocol):
 
         Args:
             data: the bytes.
-            arrivals_of: tells when the frames in them arrived.
+            arrivals_of: states when the frames in them arrived.
         """
         ...
 

@@ -113,7 +113,7 @@ def with_run_up(path):
     run_up = Recording(("x", "y", "k"), samples, RUN_UP_RATE_HZ, Path("run-up"), nan_count=0)
     setup = replace(WITH_KEYPHASOR, speed_rpm=None)
     steady = recording(MarkedOrbit(120), keyphasor=True)
-    made = calibrate_recordings([run_up, steady], setup, rotor_given=False)
+    made = calibrate_recordings([run_up, steady], setup, rotor_is_known=False)
     save_record(made, path)
     save_record(
         replace(made, run_up=None, steady=(replace(made.steady[0], fit_error=None),)), path.with_suffix(".st")

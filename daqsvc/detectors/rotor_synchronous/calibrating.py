@@ -54,7 +54,7 @@ def calibrate_recordings(
     recordings: Sequence[Recording],
     taken: RotorSetup,
     *,
-    rotor_given: bool = True,
+    rotor_is_known: bool = True,
     sweep_rpm: tuple[float, float] | None = None,
 ) -> CalibrationRecord:
     """Calibrate on recordings of a healthy machine.
@@ -62,8 +62,8 @@ def calibrate_recordings(
     Args:
         recordings: with the channels of ``taken``, by their names there; at most one run-up.
         taken: how the recordings were taken.
-        rotor_given: whether natural frequency and damping in ``taken`` are known; if not, a run-up has to
-            tell them.
+        rotor_is_known: whether natural frequency and damping in ``taken`` are known; if not, a run-up has to
+            show them.
         sweep_rpm: speed at the first and the last sample of the first recording, which is then a run-up
             without a keyphasor, even in time; positive.
 
@@ -91,11 +91,11 @@ def calibrate_recordings(
             "give one of them"
         )
     run_up_recording, run_up, two_modes = run_ups[0] if run_ups else (None, None, None)
-    if run_up is not None and (run_up.laval or not rotor_given):
+    if run_up is not None and (run_up.laval or not rotor_is_known):
         known = taken.rotor
         rotor = run_up.rotor(clearance_um=known.clearance_um, static_sag_um=known.static_sag_um)
         taken = replace(taken, rotor=rotor)
-    elif not rotor_given:
+    elif not rotor_is_known:
         raise RefusedError(
             "natural frequency and damping ratio are not known: add a run-up, or give "
             "--natural-frequency-hz and --damping-ratio"

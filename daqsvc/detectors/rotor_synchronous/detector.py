@@ -91,7 +91,7 @@ class RotorSynchronousDetector:
         rate_hz: sampling rate.
         speed_rpm: stated speed; negative if the shaft turns clockwise.
         probes: two proximity probes.
-        reference: what tells the shaft angle. ``"fixed"``: the stated speed is exact, the first sample is
+        reference: what gives the shaft angle. ``"fixed"``: the stated speed is exact, the first sample is
             angle zero. ``"orbit"``: the angle follows the orbit's 1X; a slow turn of its phase is not seen.
         rotor: what is known about the rotor.
         rules: thresholds.

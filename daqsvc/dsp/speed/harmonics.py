@@ -252,7 +252,7 @@ def shaft_rate(
     try:
         line = find_speed(enough[:, np.newaxis], series_hz, stated_hz)
     except OtherSpeedError as error:
-        wrong_hz = error.found_hz
+        wrong_hz = error.harmonics_hz
     rate_hz, sharp = scan.voted(tolerance), False
     if line is not None and line.seen and line.deviation_hz <= LINE_DEVIATION_SHARE * stated_hz:
         within = abs(line.hz / stated_hz - 1.0) <= tolerance

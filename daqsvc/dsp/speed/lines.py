@@ -35,16 +35,16 @@ class OtherSpeedError(ValueError):
     """The harmonics of another speed are far stronger.
 
     Args:
-        found_hz: revolutions per second by the harmonics.
+        harmonics_hz: revolutions per second by the harmonics.
         nominal_hz: as stated.
     """
 
-    def __init__(self, found_hz: float, nominal_hz: float) -> None:
+    def __init__(self, harmonics_hz: float, nominal_hz: float) -> None:
         super().__init__(
-            f"the shaft turns at about {60.0 * found_hz:.0f} rpm by its harmonics, not at "
+            f"the shaft turns at about {60.0 * harmonics_hz:.0f} rpm by its harmonics, not at "
             f"{60.0 * nominal_hz:g} rpm (+-{SPEED_SEARCH:.0%}): correct the speed"
         )
-        self.found_hz = found_hz
+        self.harmonics_hz = harmonics_hz
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,14 +119,14 @@ def estimate_speed(xy: Floats, rate_hz: float, around_rpm: float | None = None) 
     return SpeedEstimate(to_rpm * fit.frequency, abs(to_rpm) * fit.deviation, direction)
 
 
-def refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm: float | None) -> None:
+def refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, near_rpm: float | None) -> None:
     """Refuse a stated speed where the orbit is that of another one.
 
     Args:
         first: float64 ``[n, 2]``, the first revolutions.
         rate_hz: sampling rate.
         stated_rpm: what was stated.
-        found_rpm: the line near it; None if there is none to speak of.
+        near_rpm: the line near it; None if there is none to speak of.
 
     Raises:
         RefusedError: the orbit is that of another speed.
@@ -141,13 +141,13 @@ def refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm
         return  # no line anywhere: the search near the stated speed has reported it
     if abs(strongest_rpm / abs(stated_rpm) - 1.0) <= AT_THE_EDGE:
         return
-    if found_rpm is None:
+    if near_rpm is None:
         near = f"there is no 1X line near {abs(stated_rpm):.6g} rpm"
     else:
-        ratio = _line_um(first, rate_hz, strongest_rpm) / _line_um(first, rate_hz, found_rpm)
+        ratio = _line_um(first, rate_hz, strongest_rpm) / _line_um(first, rate_hz, near_rpm)
         if ratio < _STRONGER:
             return
-        near = f"the line at {abs(found_rpm):.1f} rpm has a {ratio:.2g}th of its amplitude"
+        near = f"the line at {abs(near_rpm):.1f} rpm has a {ratio:.2g}th of its amplitude"
     raise RefusedError(
         f"the orbit turns at {strongest_rpm:.1f} rpm: {near}; correct the speed, or use a keyphasor if the "
         "shaft does turn as stated"

@@ -80,15 +80,15 @@ def _damping_loss(identification: Identification, calibration: Calibration) -> d
     # Every rotor of the box has its own best figure; those that explain the change as well as any count.
     best = misfit.min(axis=1)
     good = best <= best.min() + 0.05 * abs(calibration.baseline[1] + identification.change[1])
-    left = left_over[misfit.argmin(axis=1)[good]]
-    damping = left * zeta[good]
-    if left.min() <= _DAMPING_LEFT[0] or left.min() >= _DAMPING_LEFT[1]:
+    fitted = left_over[misfit.argmin(axis=1)[good]]
+    damping = fitted * zeta[good]
+    if fitted.min() <= _DAMPING_LEFT[0] or fitted.min() >= _DAMPING_LEFT[1]:
         return {}
     return {
         "damping_ratio": float(np.median(damping)),
         "least": float(damping.min()),
         "most": float(damping.max()),
-        "left": float(np.median(left)),
+        "left": float(np.median(fitted)),
     }
 
 
