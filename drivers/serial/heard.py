@@ -20,6 +20,7 @@ from drivers.serial.sniff_words import (
     other_kinds_words,
     other_lines_words,
     overrun_words,
+    seen_width,
     sync_words,
     turn_words,
     unchecked_words,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 CRCS = {"ibm-3740": "begins with 0xffff", "xmodem": "begins with 0", "none": "frames have none"}
 DELIMITERS = {"lf": "\n", "cr": "\r", ";": ";"}
 _SHOWN_LINES = 2
+_WIDEST_COUNTER = 32
 _UNKNOWN_CHANNELS = "c1, c2, c3"
 
 
@@ -90,6 +92,7 @@ class HeardOnSerial(Heard):
                 proposed[sensor_key(name, "name")] = named_after
             if one["counts"] or one["time_unit"]:
                 proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
+                proposed["counter-bits"] = f"{one['bits'] or _WIDEST_COUNTER}"
             elif one["turns_at"] or not one["numeric"]:
                 # What begins again after 999 is no counter, and measures nothing: what was heard states it.
                 proposed[sensor_key(name, "type")] = NONE
@@ -301,8 +304,10 @@ def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
     """What is known of a column, in a few lines."""
     if one["turns_at"]:
         yield turn_words(one["name"], one["turns_at"])
-    elif one["counts"]:
+    elif one["counts"] and not one["bits"]:
         yield f"{one['name']} counts lines; {MUST_TURN}"
+    elif one["counts"]:
+        yield f"{one['name']} counts lines, and {seen_width(one['bits'])}"
     elif one["unit"]:
         yield f"{one['name']} is in {one['unit']}, as the device writes it behind the number"
     if one["prefix"]:

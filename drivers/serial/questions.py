@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from typing import TYPE_CHECKING, ClassVar
 
 from drivers import packed_questions as packed
@@ -12,7 +13,7 @@ from drivers.names import FRAMES, SERIAL, bus_name, lines_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.heard import CRCS, DELIMITERS, HeardOnSerial
 from drivers.serial.sniff import SerialSniffer
-from drivers.serial.sniff_words import MUST_TURN
+from drivers.serial.sniff_words import MUST_TURN, UNSEEN_WIDTH
 from drivers.sniffing import is_waveform_rate, sniffed, type_by_unit, unit_of_suffix
 from drivers.toml_lines import array, entry
 
@@ -152,6 +153,8 @@ class SerialQuestions(BusQuestions):
         is_time = _is_time(answers["counter"])
         kinds = {"count": "it counts lines", "s": "time in s", "ms": "time in ms", "us": "time in us"}
         yield self.choose("counts", kinds, "ms" if is_time else "count")
+        if answers["counts"] == "count":
+            yield self.choose("counter-bits", dict.fromkeys(("8", "16", "32"), ""), "32", quiet=True)
         yield from self._ask_around(answers["counter"])
 
     def _ask_around(self, column: str) -> Iterator[Question]:
@@ -252,7 +255,12 @@ class SerialQuestions(BusQuestions):
             yield entry("no_counter", value=True, comment="losses are estimated from the times of arrival")
         elif answers["counts"] == "count":
             yield f"# {MUST_TURN[0].upper()}{MUST_TURN[1:]}."
-            counter = {"column": answers["counter"], **_around(answers, answers["counter"])}
+            counter = {"column": answers["counter"]}
+            if answers["counter-bits"] == "32":
+                yield from (f"# {line}" for line in textwrap.wrap(UNSEEN_WIDTH, 98))
+            else:
+                counter["bits"] = int(answers["counter-bits"])
+            counter |= _around(answers, answers["counter"])
             yield entry("counter", counter, "losses are counted by it")
         else:
             time = {"column": answers["counter"], "unit": answers["counts"]}

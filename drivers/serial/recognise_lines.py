@@ -43,6 +43,10 @@ _WRAP = 256
 """What counters wrap at is a multiple of it."""
 _TURN_SHARE = 0.05
 """So near to the turn are the values before and after it, as lines may be missing there."""
+_WIDTHS = (8, 16)
+"""Bits of a counter that a few minutes may show; one of 32 turns once in months."""
+_MOST_AT_TURN = 16
+"""Lines that may be missing where a counter of bits begins again."""
 _MOST_KINDS = 16
 _LEAST_SHARE = 0.02
 """Of the lines begin with a word that is no accident."""
@@ -83,6 +87,7 @@ class Column:
         most: largest one.
         step: by how much it counts, if it is whole numbers that do; else 0.
         turns_at: the power of ten at which it was seen to begin again at 0; else 0. No counter of bits does.
+        bits: width of a counter that was seen to begin again at 0 after it; else 0.
         grows: whether it never falls, and grows at all.
         per_line: by how much it grows from line to line, on average; of a counter, without its turns.
         prefix: the text in front of the number that is the same in all of them, such as a name; else empty.
@@ -106,6 +111,7 @@ class Column:
     absent: int = 0
     absent_text: str = ""
     swings: bool = False
+    bits: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,6 +472,7 @@ def _column(
         len(absent),
         absent[-1] if absent else "",
         _swings(values),
+        _bits_of(values, step),
     )
 
 
@@ -519,6 +526,20 @@ def _turn_of(values: NDArray[np.float64], step: float) -> int:
     turns_at = 10.0 ** np.ceil(np.log10(np.maximum(before, 1.0) + step))
     turned = (before >= (1 - _TURN_SHARE) * turns_at) & (after <= _TURN_SHARE * turns_at) & (beyond < before)
     return int(turns_at[turned][0]) if turned.any() else 0
+
+
+def _bits_of(values: NDArray[np.float64], step: float) -> int:
+    """The bits after which a counter begins again at 0; 0 if that was not seen."""
+    if step != 1 or len(values) < 3:
+        return 0
+    before, after, beyond = values[:-2], values[1:-1], values[2:]
+    for bits in _WIDTHS:
+        turns_at = 2**bits
+        # Behind a damaged digit the count goes on as before it.
+        fell = (before - after > turns_at / 2) & (beyond < before)
+        if values.max() < turns_at and (fell & ((after - before) % turns_at <= _MOST_AT_TURN)).any():
+            return bits
+    return 0
 
 
 def _sum_fits(line: str, checksum: str) -> bool:

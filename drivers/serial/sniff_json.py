@@ -36,6 +36,7 @@ class ColumnFigures(TypedDict):
         swings: whether it swings about 0, as a vibration does.
         absent: in how many lines it has no value, such as `---`.
         absent_text: its text in the last one of these; null if there are none.
+        bits: width of a counter that was seen to begin again at 0; null if that was not seen.
     """
 
     name: str
@@ -51,6 +52,7 @@ class ColumnFigures(TypedDict):
     swings: bool
     absent: int
     absent_text: str | None
+    bits: int | None
 
 
 class SerialFigures(TypedDict):

@@ -15,6 +15,7 @@ from drivers.serial.sniff_words import (
     LINES_NEED,
     MUST_TURN,
     NO_NUMBERS,
+    UNSEEN_WIDTH,
     WIDEST,
     absent_words,
     frames_need,
@@ -22,6 +23,7 @@ from drivers.serial.sniff_words import (
     other_lines_words,
     overrun_words,
     printable,
+    seen_width,
     sync_words,
     turn_words,
     unchecked_words,
@@ -436,6 +438,7 @@ class Report(NamedTuple):
                         "swings": one.swings,
                         "absent": one.absent,
                         "absent_text": one.absent_text if one.absent else None,
+                        "bits": one.bits or None,
                     }
                     for one in what.columns
                 ],
@@ -528,9 +531,7 @@ class Report(NamedTuple):
         if what.decimal != ".":
             yield f"decimal = {quoted(what.decimal)}"
         if counter is not None:
-            bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
-            table = f"{{ column = {quoted(names[counter])}, bits = {bits}{_texts(counter)} }}"
-            yield f"counter = {table}    # as far as it was seen: {MUST_TURN}"
+            yield from _counter_lines(counter, names[counter])
         elif place is None:
             yield "no_counter = true    # none was seen, and no time: losses are estimated from the arrivals"
         else:
@@ -690,6 +691,18 @@ def _counter(what: TextLines) -> Column | None:
 def _prefixes(what: TextLines) -> str:
     """The words by which kinds of lines are told apart."""
     return ", ".join(kind.prefix for kind in what.kinds)
+
+
+def _counter_lines(counter: Column, name: str) -> Iterator[str]:
+    """The key of the column that counts lines.
+
+    One that is taken too narrow loses all lines once it is past its width: only what was seen is stated.
+    """
+    bits = f", bits = {counter.bits}" if counter.bits else ""
+    if not bits:
+        yield from (f"# {line}" for line in textwrap.wrap(UNSEEN_WIDTH, 98))
+    known = seen_width(counter.bits) if bits else f"as far as it was seen: {MUST_TURN}"
+    yield f"counter = {{ column = {quoted(name)}{bits}{_texts(counter)} }}    # {known}"
 
 
 def _texts(column: Column) -> str:

@@ -66,6 +66,16 @@ ANY_BAUD = "as good as any: the port does not use it"
 
 MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"
 """What a few seconds of a counter do not show."""
+UNSEEN_WIDTH = (
+    "That the counter has 32 bits is a guess: write bits = 16 in it if it begins again at 0 after 65535, "
+    "bits = 8 if after 255."
+)
+"""The same of a counter that was not seen to begin again: one that is taken too narrow loses all lines."""
+
+
+def seen_width(bits: int) -> str:
+    """What is known of a counter that was seen to begin again."""
+    return f"begins again at 0 after {2**bits - 1}, as it was seen"
 
 
 def turn_words(name: str, turns_at: int) -> str:

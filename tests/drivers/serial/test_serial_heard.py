@@ -168,6 +168,22 @@ def test_why_a_column_is_left_out_shows_what_is_no_number(tmp_path: Path) -> Non
     assert 'write suffix = "mm of oil" in its channel if this is always there' in text
 
 
+@pytest.mark.parametrize(
+    ("begin", "turns", "bits"), [(65_000, 2**32, None), (65_500, 65_536, 16), (220, 256, 8), (7, 2**32, None)]
+)
+def test_sniff_and_new_take_the_width_of_a_counter_that_was_seen(
+    tmp_path: Path, begin: int, turns: int, bits: int | None
+) -> None:
+    """A width that is too narrow loses all lines for ever once the count has passed it."""
+    found = sniffed(lambda number: b"%d;%d.25\r\n" % ((begin + number) % turns, number % 7), 20.0)
+    file, text = written(found, tmp_path / "m.toml")
+    counters = [only_stream(one)["layout"]["counter"] for one in (tomllib.loads(found.fragment), file)]
+    assert counters == [{"column": "c1"} | ({} if bits is None else {"bits": bits})] * 2
+    guess = "32 bits is a guess: write bits = 16 in it if it begins again at 0 after 65535"
+    assert [guess in one.replace("\n# ", " ") for one in (text, found.fragment)] == [bits is None] * 2
+    assert any("c1 counts lines" in line for line in HeardOnSerial(found.figures, SerialQuestions()).lines)
+
+
 def test_of_columns_of_hex_none_is_kept_as_a_decimal_number() -> None:
     found = of_lines("{hexed}")
     assert [one["numeric"] for one in found.figures["columns"]] == [False, False, False]

@@ -320,6 +320,28 @@ def test_what_counts_to_four_again_and_again_counts_no_lines() -> None:
     assert [column.turns_at for column in wraps.columns] == [0, 0]
 
 
+@pytest.mark.parametrize(
+    ("begin", "turns", "bits"),
+    [(200, 256, 8), (65_500, 65_536, 16), (65_500, 2**32, 0), (200, 2**32, 0), (3, 2**32, 0)],
+)
+@pytest.mark.parametrize("lost", [0, 3])
+def test_the_width_of_a_counter_is_known_once_it_has_begun_again(
+    begin: int, turns: int, bits: int, lost: int
+) -> None:
+    counts = [(begin + k) % turns for k in range(120) if not 36 <= k < 36 + lost]
+    what = recognised(b"".join(b"%d,%d\n" % (count, 7 * k % 11) for k, count in enumerate(counts))).what
+    assert isinstance(what, TextLines)
+    assert [(column.step, column.bits) for column in what.columns] == [(1, bits), (0, 0)]
+
+
+def test_a_damaged_digit_of_a_counter_is_no_turn_of_it() -> None:
+    counts = [65_500 + k for k in range(120)]
+    counts[30] = 0
+    what = recognised(b"".join(b"%d,%d\n" % (count, 7 * k % 11) for k, count in enumerate(counts))).what
+    assert isinstance(what, TextLines)
+    assert what.columns[0].bits == 0
+
+
 @pytest.mark.parametrize("turns_at", [100, 1000, 10_000])
 @pytest.mark.parametrize("lost", [0, 3])
 def test_a_count_that_begins_again_at_a_power_of_ten_is_seen(turns_at: int, lost: int) -> None:
