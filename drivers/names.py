@@ -20,6 +20,8 @@ LONGEST_NAME = 64
 _LONGEST_TABLE = 40
 SENSOR_PREFIX = {"proximity": "probe-", "accelerometer": "accel-", "velocity": "velocity-"}
 """What the name of a sensor begins with, by its type."""
+_REGISTER = re.compile(r"r\d+")
+"""Channels that are called like their registers, as those found on a Modbus line: each table may have one."""
 _LASTING = Path("/dev/serial")
 """Below it are the long names of the serial ports, each a link to the short one."""
 
@@ -61,14 +63,20 @@ def unit_stream(unit: int, table: str) -> str:
     return f"unit-{unit}{'-input' * (table == 'input')}"
 
 
-def sensor_name(channel: str, kind: str, stream: str = "") -> str:
+def is_register(channel: str) -> bool:
+    """Whether a channel is called like its register, so that its name states no quantity."""
+    return _REGISTER.fullmatch(channel) is not None
+
+
+def sensor_name(channel: str, kind: str, stream: str, *, by_stream: bool = False) -> str:
     """Of the sensor on a channel.
 
     Args:
         channel: its name.
         kind: type of the sensor.
-        stream: name of its stream, where others have channels of the same names.
+        stream: name of its stream.
+        by_stream: whether others have channels of the same names: its own then begins with the stream.
     """
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "-", channel).strip("-") or "sensor"
-    before = f"{stream}-" if stream else ""
+    before = f"{stream}-" if by_stream or is_register(channel) else ""
     return f"{SENSOR_PREFIX.get(kind, '')}{before}{plain}"[:LONGEST_NAME]

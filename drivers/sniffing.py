@@ -269,7 +269,7 @@ def sensor_lines(
         lines += [
             "",
             "[[sensors]]",
-            f"name = {quoted(unused(sensor_name(channel, kind, stream if by_stream else ''), taken))}",
+            f"name = {quoted(unused(sensor_name(channel, kind, stream, by_stream=by_stream), taken))}",
             f"type = {quoted(kind)}{by if is_guess else ''}",
             f"stream = {quoted(stream)}",
             f"channel = {quoted(channel)}",

@@ -24,6 +24,7 @@ from drivers.modbus.manual_addresses import (
     doubt_with_table,
     table_meant,
 )
+from drivers.modbus.proposed import TIMEOUT_MS, unit_of_register
 from drivers.modbus.sniff import AUTO, LAST_REGISTER, ModbusSniffer, registers_of, units_of
 from drivers.names import MODBUS, unit_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
@@ -54,7 +55,6 @@ _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
 _UNITS, _WHOLE = ("1-10", "11-247"), "1-247"
 """Most devices have one of the first addresses; to ask for all takes two minutes."""
 _OTHERS = f"To see which other units answer, add --units {_WHOLE}"
-_TIMEOUT_MS = 500.0
 
 
 class _ModbusQuestions(BusQuestions):
@@ -178,7 +178,7 @@ class _ModbusQuestions(BusQuestions):
         return heard.HeardUnits(figures, lines, answers["registers"], self._next_address)
 
     def _ask_timeout(self) -> Question:
-        return self.ask("timeout-ms", q.number_in("ms"), f"{_TIMEOUT_MS:g}")
+        return self.ask("timeout-ms", q.number_in("ms"), f"{TIMEOUT_MS:g}")
 
     def _ask_units(self) -> Question:
         """Which units are to be found; only an option is asked for them."""
@@ -323,8 +323,7 @@ class _ModbusQuestions(BusQuestions):
         if answers["way"] != "values":
             return ("accelerometer" if is_waveform_rate(answers["rate"]) else "trend"), None
         unit, kind = _unit(channel), answers[sensor_key(channel, "register-type")]
-        # A float of a register whose meaning is not known is a quantity, and no count.
-        return "trend", None if unit == "count" and kind.startswith("float") else unit
+        return "trend", unit_of_register(kind) if unit == "count" else unit
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""

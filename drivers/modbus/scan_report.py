@@ -6,6 +6,7 @@ import math
 import textwrap
 from typing import TYPE_CHECKING, NamedTuple
 
+from drivers.modbus.proposed import TIMEOUT_MS, unit_of_register
 from drivers.modbus.readings import chosen, is_signed, readings, undecided
 from drivers.modbus.replies import EXCEPTIONS
 from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER, TABLES, units_in_words
@@ -274,7 +275,7 @@ class ScanReport:
         else:
             lines += ['transport = "rtu"', f"serial_port = {quoted(bus.serial_port)}", f"baud = {bus.baud:_}"]
             lines.append(f"parity = {quoted(bus.parity)}")
-        lines.append(f"timeout_ms = {bus.timeout_ms}")
+        lines.append(f"timeout_ms = {max(bus.timeout_ms, TIMEOUT_MS)}")
         sensors: set[str] = set()
         for table, numbers, doubted in tables:
             lines += ["", *_stream(table, numbers, doubted, sensors)]
@@ -396,7 +397,8 @@ def _stream(
         yield f"# left out, as they did not change: {_runs(left_out)}"
     if beyond:
         yield f"# left out, as there are so many: {_runs(beyond)}"
-    yield from sensor_lines(name, dict.fromkeys((one.name for one in channels), "1"), sensors)
+    units = {one.name: unit_of_register(one.type) for one in channels}
+    yield from sensor_lines(name, units, sensors)
 
 
 class _Channel(NamedTuple):

@@ -88,7 +88,7 @@ class HeardOnSerial(Heard):
             if kind := _swinging_type(one, name, answers.get("rate", self.figures["rate_hz"])):
                 proposed[sensor_key(name, "type")] = kind
             if (chosen := answers.get(sensor_key(name, "type"))) and self._is_of_several(answers):
-                named_after = sensor_name(name, chosen, lines_stream(answers["prefix"]))
+                named_after = sensor_name(name, chosen, lines_stream(answers["prefix"]), by_stream=True)
                 proposed[sensor_key(name, "name")] = named_after
             if one["counts"] or one["time_unit"]:
                 proposed |= {"counter": name, "counts": one["time_unit"] or "count"}

@@ -31,9 +31,17 @@ def test_names_keep_the_letters_of_the_device_and_need_no_quotes() -> None:
     assert names.lines_stream("$ACC") == "ACC"
     assert (names.lines_stream(None), names.lines_stream("$")) == ("lines", "lines")
     assert names.bus_name("/", "can0") == "can0"
-    assert names.sensor_name("VibDE", "accelerometer") == "accel-VibDE"
-    assert names.sensor_name("Öl", "trend", "K1") == "K1-l"
-    assert len(names.sensor_name("x" * 80, "velocity")) == names.LONGEST_NAME
+    assert names.sensor_name("VibDE", "accelerometer", "Vib") == "accel-VibDE"
+    assert names.sensor_name("Öl", "trend", "K1", by_stream=True) == "K1-l"
+    assert len(names.sensor_name("x" * 80, "velocity", "K1")) == names.LONGEST_NAME
+
+
+def test_what_is_called_like_a_register_has_the_name_of_its_stream_before_it() -> None:
+    """Several tables of a line have a register of that number."""
+    streams = [names.unit_stream(17, table) for table in ("holding", "input")]
+    found = [names.sensor_name("r2", "trend", stream) for stream in streams]
+    assert found == ["unit-17-r2", "unit-17-input-r2"]
+    assert names.sensor_name("rpm2", "trend", "unit-17") == "rpm2"
 
 
 def test_a_name_that_is_taken_gets_a_number_and_stays_short_enough() -> None:

@@ -212,7 +212,7 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
     if chosen == NONE:
         return
     taken = {one.name for one in sensors(answers)}
-    yield ask("name", q.name, unused(sensor_name(channel, chosen), taken))
+    yield ask("name", q.name, unused(sensor_name(channel, chosen, bus.stream_name(answers)), taken))
     if chosen in _UNITS:
         units = dict.fromkeys(_UNITS[chosen], "")
         yield ask("unit", q.one_of(units), unit if unit in units else next(iter(units)), choices=units)

@@ -145,7 +145,7 @@ def test_what_it_proposes_passes_check_in_a_whole_file(
     # A busy computer does not send as often as it should here.
     kind = "accelerometer" if is_waveform_rate(by_id[513]["rate_hz"]) else "trend"
     assert [(one["name"], one["type"], one["unit"]) for one in sensors] == [
-        (sensor_name(name, kind), kind, "g") for name in ("AccelX", "AccelY", "AccelZ")
+        (sensor_name(name, kind, ""), kind, "g") for name in ("AccelX", "AccelY", "AccelZ")
     ]
 
 

@@ -1011,6 +1011,34 @@ def test_the_table_whose_values_move_is_proposed_and_the_other_named(
     assert "\nUnit 1 has holding registers, too; this file reads input registers.\n" in said
 
 
+def test_tables_of_sniff_fit_below_a_file_of_new_whatever_tables_the_unit_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = Watched()
+    both.put("input", 0, struct.pack(">4H", 2, 4, 6, 8))
+    both.put("holding", 2, struct.pack(">2H", 1, 3))
+    both.put("input", 40, struct.pack(">f", 12.5))
+    with tcp({17: both}) as target:
+        written = new(tmp_path, target, "--unit=17", "--registers=0-50", "--table=input")
+        capsys.readouterr()
+        asked = ("--units", "17", "--registers", "0-50", "--function", "both", "--json")
+        assert main(words(target, *asked, "--timeout-ms", "300")) == 0
+    proposed = tomllib.loads(figures(capsys)["machine_file"])
+    assert proposed["buses"]["modbus"]["timeout_ms"] == written["buses"]["modbus"]["timeout_ms"] == 500.0
+
+    def sensors(tables: dict[str, Any]) -> dict[tuple[str, str], tuple[str, str]]:
+        return {(s["stream"], s["channel"]): (s["name"], s["unit"]) for s in tables["sensors"]}
+
+    mine, others = sensors(written), sensors(proposed)
+    assert {stream for stream, _ in mine} == {"unit-17-input"}
+    assert {stream for stream, _ in others} == {"unit-17", "unit-17-input"}
+    assert mine["unit-17-input", "r2"] == ("unit-17-input-r2", "count")
+    assert mine["unit-17-input", "r40"] == ("unit-17-input-r40", "1")
+    assert {key: others[key] for key in mine} == mine
+    both_files = {**others, **mine}
+    assert len({name for name, _ in both_files.values()}) == len(both_files)
+
+
 class Elsewhere(ModbusUnit):
     """A unit whose values are beyond the registers that are read unless others are asked for."""
 
