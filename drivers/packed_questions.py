@@ -110,10 +110,12 @@ def guess(answers: Answers, channel: str) -> tuple[str, str | None]:
     """See `BusQuestions.guess`."""
     named, signed = by_name(channel), not answers["raw-type"].startswith("u")
     carried_v = abs(answers["scale"]) * 2.0 ** (8 * RAW_BYTES[answers["raw-type"]] - 1)
-    probe = signed and carried_v > _PROBE_V and in_volts(answers)
-    if named == "keyphasor" and not probe:
+    volts_of_probe = signed and carried_v > _PROBE_V and in_volts(answers)
+    if named == "keyphasor" and not volts_of_probe:
         named = "trend"  # marks of a shaft are no vibration, whatever their unit is
     slow = not is_waveform_rate(answers["rate"])
+    # An accelerometer is digitised with the same scale: only a keyphasor beside it shows that of a probe.
+    probe = volts_of_probe and any(by_name(one) == "keyphasor" for one in answers["channels"])
     return named or ("proximity" if probe and not slow else "trend" if slow else "accelerometer"), None
 
 

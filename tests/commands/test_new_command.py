@@ -314,9 +314,15 @@ def test_a_peak_value_gets_no_zones_of_an_rms_on_any_bus(tmp_path, options, unit
 
 
 def assumed_keys(text: str) -> set[str]:
-    """Keys of the lines that are marked; of a channel, ``channels``."""
+    """Keys of the lines that are marked; of a channel, ``channels``, or what of it is assumed."""
     marked = [line.strip() for line in text.splitlines() if "  # assumed" in line]
-    return {"channels" if line.startswith("{") else line.partition(" = ")[0] for line in marked}
+    found = {line.partition(" = ")[0] for line in marked if not line.startswith("{")}
+    for line in marked:
+        if line.startswith("{"):
+            _, _, parts = line.partition("  # assumed")
+            named = [part for part in parts.removeprefix(": ").split(", ") if part]
+            found |= {f"{part} of channels" for part in named} or {"channels"}
+    return found
 
 
 @pytest.mark.parametrize(
@@ -366,13 +372,14 @@ def test_what_enter_took_of_the_machine_is_marked_and_what_was_typed_is_not(tmp_
         )
         return assumed_keys(machine_text(answers, "m.toml"))
 
-    assert marked() == {"speed_rpm", "rate_hz", "way", "unit", "channels", "zones"}
+    of_channels = {f"{part} of channels" for part in ("address", "type", "scale")}
+    assert marked() == {"speed_rpm", "rate_hz", "way", "unit", "zones"} | of_channels
     typed = {"speed": "1480", "class": "2-rigid", "rate": "1", "way": "values", "unit": "1"}
     values = {"address": "0", "register-type": "uint16", "scale": "0.01", "unit": "mm/s"}
     typed |= {f"sensor.vibration.{key}": text for key, text in values.items()}
     assert marked(**typed) == set()
     del typed["sensor.vibration.scale"]
-    assert marked(**typed) == {"channels"}
+    assert marked(**typed) == {"scale of channels"}
 
 
 def test_what_was_heard_is_not_assumed_though_it_is_the_usual_value(tmp_path):
@@ -403,10 +410,40 @@ def test_listening_shows_nothing_of_how_samples_lie_in_registers(tmp_path, way, 
 
     keys, notes = marked(lambda *_: heard)
     layouts = {"waveform": {"block_id", "samples"}, "ring": {"count", "depth"}, "fifo": {"count"}}
-    assert keys == {"rate_hz", "address", "channels", "type", "unit"} | layouts[way]
+    of_channels = {"type of channels", "scale of channels"}  # their names were heard
+    assert keys == {"rate_hz", "address", "type", "unit"} | of_channels | layouts[way]
     [words] = [one for one in notes if one.startswith("Assumed, as nobody has stated it: ")]
     assert set(words.partition(": ")[2].partition(". ")[0].split(", ")) == keys
-    assert marked(None)[0] - keys <= {"table"}
+    assert marked(None)[0] - keys <= {"table", "channels"}
+
+
+@pytest.mark.parametrize(
+    "bus",
+    [
+        {"bus": "modbus-tcp", "host": "h", "way": "waveform", "unit": "1", "rate": "6400"},
+        {"bus": "serial", "port": "/dev/ttyS0", "framing": "cobs", "rate": "1000"},
+        {"bus": "can", "id": "0x201", "rate": "6400"},
+    ],
+)
+@pytest.mark.parametrize("scale", [None, "0.001", "2"])
+def test_a_scale_that_is_stated_makes_no_other_sensor_and_is_not_assumed(tmp_path, bus, scale):
+    given = {**bus, "channels": "de, fe"} | ({} if scale is None else {"scale": scale})
+    answers = conduct(
+        tmp_path / "m.toml",
+        Given(given, defaults=True),
+        None,
+        print,
+        lambda *_: HeardThis({"scale": "1", "raw-type": "int16"}),
+    )
+    text = machine_text(answers, "m.toml")
+    assert [one["type"] for one in tomllib.loads(text)["sensors"]] == ["accelerometer"] * 2
+    assert "gap_ok_v" not in text
+    assert not {"channels", "name of channels", "scale of channels"} & assumed_keys(text)
+    beforehand = Given({key: text for key, text in given.items() if key != "channels"}, defaults=True)
+    answers = conduct(tmp_path / "m.toml", beforehand, None, print)
+    keys = assumed_keys(machine_text(answers, "m.toml"))
+    assert keys >= ({"channels"} if scale is None else {"name of channels", "type of channels"})
+    assert "scale of channels" not in keys
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ _OTHER = {
     "serial_port": ("port",),
 }
 """Questions behind keys of buses and streams, where they are called otherwise."""
+_PART_KEY = "{} of channels"
 _ONLY_TYPE = 'type = "trend"'
 """The only type that slow values can have."""
 _NEVER = {"interface", "timeout-ms", "tcp-port", "max-count", "length", "payload-length", "acknowledge"}
@@ -39,7 +40,26 @@ _OF_SENSOR = {
     "angle_deg": "angle",
     "threshold_v": "threshold",
 }
-_OF_REGISTER = ("address", "register-type", "order", "scale", "bits", "prefix", "suffix")
+_OF_CHANNELS = {
+    "channels": "name",
+    "signals": "signals",
+    "consecutive": "signals",
+    "raw-type": "type",
+    "scale": "scale",
+}
+"""What of the line of a channel is in the answers to questions about all channels."""
+_OF_CHANNEL = {
+    "address": "address",
+    "register-type": "type",
+    "order": "order",
+    "scale": "scale",
+    "bits": "bits",
+    "prefix": "prefix",
+    "suffix": "suffix",
+}
+"""The same of questions about one channel."""
+_MAIN = {"name", "signals", "address", "type", "scale"}
+"""What is named as assumed one by one, if somebody has stated another of them."""
 
 
 def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]]:
@@ -64,10 +84,12 @@ def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]
             channel = tomllib.loads(next(rest, 'channel = ""'))["channel"] if table == "sensors" else ""
             continue
         if (name := _CHANNEL.match(line)) is not None and table.startswith("streams."):
-            of_channels = ("channels", "raw-type", "scale", "signals")
-            one = [*of_channels, *(sensor_key(name[1], topic) for topic in _OF_REGISTER)]
-            key = "channels"
-        elif (begin := _KEY.match(line)) is not None:
+            if parts := _parts(name[1], answers):
+                is_all = parts == ["channels"]
+                marked_lines[place] = _with_comment(line, "" if is_all else f": {', '.join(parts)}")
+                keys |= dict.fromkeys(parts if is_all else map(_PART_KEY.format, parts))
+            continue
+        if (begin := _KEY.match(line)) is not None:
             key = begin[1]
             one = _questions(table, key, channel, tables)
         else:
@@ -95,8 +117,18 @@ def _questions(table: str, key: str, channel: str, tables: Collection[str]) -> l
     )
 
 
-def _with_comment(line: str) -> str:
+def _parts(channel: str, answers: Answers) -> list[str]:
+    """What of the line of a channel is assumed: ``channels`` if nobody has stated any of it."""
+    questions = {**_OF_CHANNELS, **{sensor_key(channel, topic): part for topic, part in _OF_CHANNEL.items()}}
+    parts = dict.fromkeys(part for key, part in questions.items() if key in answers)
+    assumed = {part for key, part in questions.items() if key in answers[ASSUMED]}
+    stated = _MAIN.intersection(parts) - assumed
+    return [part for part in parts if part in assumed] if stated else ["channels"] * bool(assumed)
+
+
+def _with_comment(line: str, of_it: str = "") -> str:
+    """The line with the comment; ``of_it`` states what of it is assumed, if not all is."""
     text, mark, comment = line.rpartition("  # ")
     if not mark:
-        return behind(line, "assumed")
-    return f"{text}{mark}assumed; {comment}"
+        return behind(line, f"assumed{of_it}")
+    return f"{text}{mark}assumed{of_it}; {comment}"
