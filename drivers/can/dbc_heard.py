@@ -5,10 +5,18 @@ from __future__ import annotations
 import shlex
 from typing import TYPE_CHECKING, Any
 
-from drivers.can.dbc_likely import beside_samples, likely_counter, likely_measured, samples_of_one
+from drivers.can.dbc_likely import likely_counter, likely_measured
 from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
+from drivers.can.numbered import (
+    Level,
+    beside_samples,
+    is_named_sample,
+    levels_apart,
+    numbered,
+    samples_of_one,
+)
 from drivers.can.other_source import other_sources
-from drivers.can.sniff import CLOCK, STATE, numbered, of_another_stream
+from drivers.can.sniff import CLOCK, STATE, of_another_stream
 from drivers.questions import NONE, Answers, sensor_key
 from drivers.sniffing import usual_rate
 
@@ -73,6 +81,8 @@ class HeardMessages(HeardOnCan):
             proposed["consecutive"] = "yes" if fits else "no"
             counts = "samples" if self._samples_in_frame(answers) == sampled[answers["counter"]] else "frames"
             proposed["counter-counts"] = counts
+        elif "signals" in answers and self._apart(answers):
+            proposed["consecutive"] = "no"
         if signals := self._without_clocks(answers | {"message": chosen["message"]}):
             proposed["signals"] = ", ".join(signals)
         rates = [one["rate_hz"] for one in self.figures["ids"] if one["message"] == chosen["message"]]
@@ -101,12 +111,29 @@ class HeardMessages(HeardOnCan):
         return [name for name, unit in units.items() if unit is None or unit.quantity == "time"]
 
     def _without_clocks(self, answers: Answers) -> list[str]:
-        """What is measured by the DBC file, without what was heard to be a clock; empty if there is none."""
+        """What is measured by the DBC file, as far as what was heard shows that; empty if it shows nothing.
+
+        A clock is left out, and what is beside numbered signals is read, too, if they are separate sensors.
+        """
         clocks = {*self._clocks(answers), answers.get("counter")}
-        if clocks <= {answers.get("counter")}:
+        apart = bool(self._apart(answers))
+        if clocks <= {answers.get("counter")} and not apart:
             return []
         signals = self._messages[answers["message"]].signals
-        return likely_measured([one for one in signals if one.name not in clocks])
+        return likely_measured([one for one in signals if one.name not in clocks], apart=apart)
+
+    def _apart(self, answers: Answers) -> list[str]:
+        """Signals that are numbered like samples of one channel, and have clearly different levels."""
+        heard = self._signals(answers)
+        if answers.get("counter", "") in self._counting_samples(heard):
+            return []
+        signals = self._messages[answers["message"]].signals
+        counts = {one.name: abs(float(one.scale)) for one in signals}
+        levels = {
+            one["signal"]: Level(one["frames"], one["mean"], one["deviation"], counts[one["signal"]])
+            for one in heard
+        }
+        return levels_apart(signals, answers.get("signals") or [*levels], levels)
 
     def unheard(self, answers: Answers) -> str:
         """See `Heard.unheard`."""
@@ -210,7 +237,20 @@ class HeardMessages(HeardOnCan):
         if silent := [name for name in answers["signals"] if name not in heard]:
             notes.append(f"No value was heard of {', '.join(silent[:SHOWN])}.")
         notes += _doubts(one for message in self._decoded for one in message["signals"])
-        if "consecutive" in taken and not answers["consecutive"]:
+        if "consecutive" in taken and answers["consecutive"] and answers.get("counter-counts") != "samples":
+            notes += [
+                f"{names[0]} to {names[-1]} are read as {len(names)} samples of {channel}: a guess by their "
+                "names. If they are separate sensors, give --consecutive no."
+                for channel, names in samples_of_one(answers["signals"]).items()
+                if not is_named_sample(channel)
+            ]
+        if "consecutive" in taken and (apart := self._apart(answers)):
+            levels = ", ".join(f"{heard[name]['deviation']:.3g}" for name in apart)
+            notes.append(
+                f"{apart[0]} to {apart[-1]} are read as {len(apart)} channels, as their levels differ "
+                f"(standard deviations {levels})."
+            )
+        elif "consecutive" in taken and not answers["consecutive"]:
             notes += [
                 f"{names[0]} to {names[-1]} are read as {len(names)} channels: nothing shows whether they "
                 f"are {len(names)} samples of one. If they are, give --consecutive yes."

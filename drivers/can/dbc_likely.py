@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from drivers.bus_questions import is_count
-from drivers.can.sniff import number_of, numbered
+from drivers.can.numbered import most_likely_samples, unit_names
 from drivers.sniffing import TYPE_OF_UNIT
 
 if TYPE_CHECKING:
@@ -63,45 +63,6 @@ def _of_pages(signals: Iterable[Any]) -> bool:
     return any(one.multiplexer_ids for one in signals)
 
 
-def samples_of_one(signals: Sequence[str]) -> dict[str, list[str]]:
-    """Signals that may be samples of one channel, by its name; none if a stream cannot read them as such.
-
-    Others may be beside them: these come once a frame, and a stream of their own reads them.
-    """
-    by_stem = numbered(signals)
-    return by_stem if len({len(names) for names in by_stem.values()}) == 1 else {}
-
-
-def beside_samples(signals: Sequence[str]) -> list[str]:
-    """Signals beside those that may be samples of one channel."""
-    samples = {name for names in samples_of_one(signals).values() for name in names}
-    return [name for name in signals if samples and name not in samples]
-
-
-def most_likely_samples(signals: Iterable[Any], names: Sequence[str]) -> list[str]:
-    """Those of the names that count from 0, and are of vibration: hardly of separate sensors."""
-    units = unit_names(signals, names)
-    by_stem = {
-        stem: of_one
-        for stem, of_one in numbered(names).items()
-        if number_of(of_one[0]) == 0 and all(units.get(name) in TYPE_OF_UNIT for name in of_one)
-    }
-    return [name for name in names if any(name in of_one for of_one in by_stem.values())]
-
-
-def unit_names(signals: Iterable[Any], names: Iterable[str]) -> dict[str, str]:
-    """Units of the signals of these names, as far as they are known, as machine files write them.
-
-    Those of peak values are not among them: what is known of ``mm/s`` is not so of ``mm/s pk``.
-    """
-    from daqsvc.settings.units import is_of_peak, unit_of  # noqa: PLC0415 - brings the settings
-
-    chosen = set(names)
-    stated = {one.name: one.unit or "" for one in signals if one.name in chosen}
-    known = {name: unit_of(text) for name, text in stated.items() if not is_of_peak(text)}
-    return {name: unit.name for name, unit in known.items() if unit is not None}
-
-
 def never_negative(signal: Any) -> bool:
     """See `drivers.can.dbc.never_negative`."""
     from drivers.can import dbc  # noqa: PLC0415 - cantools is slow to import
@@ -145,8 +106,13 @@ def _may_count(signal: Any, signals: int) -> bool:
     return bool(plain) and signals > 1 and not signal.is_multiplexer
 
 
-def likely_measured(signals: Sequence[Any]) -> list[str]:
-    """Names of what one stream measures: no states, no selectors, one page of a multiplexed message."""
+def likely_measured(signals: Sequence[Any], *, apart: bool = False) -> list[str]:
+    """Names of what one stream measures: no states, no selectors, one page of a multiplexed message.
+
+    Args:
+        signals: of the message.
+        apart: whether numbered signals are of separate sensors, so that others may be beside them.
+    """
     numbers = [one for one in signals if not one.is_multiplexer and not one.choices]
     always = [one for one in numbers if one.multiplexer_ids is None]
     known = {one.name: one for one in signals}
@@ -156,5 +122,5 @@ def likely_measured(signals: Sequence[Any]) -> list[str]:
             page.append(one)
     for likely in (always, page):
         if with_unit := [one.name for one in likely if one.unit]:
-            return most_likely_samples(signals, with_unit) or with_unit
+            return (not apart and most_likely_samples(signals, with_unit)) or with_unit
     return [one.name for one in (always or page)[:1]]

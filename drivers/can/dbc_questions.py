@@ -15,23 +15,28 @@ from drivers import questions as q
 from drivers.bus_questions import BEFOREHAND
 from drivers.can.dbc_heard import HeardMessages
 from drivers.can.dbc_likely import (
-    beside_samples,
     by_page_of,
     come_together,
     likely_counter,
     likely_measured,
     likely_message,
     may_be_counters,
-    most_likely_samples,
     never_negative,
-    samples_of_one,
     share_of_frames,
-    unit_names,
     with_signals,
 )
 from drivers.can.heard import SHOWN
+from drivers.can.numbered import (
+    beside_samples,
+    is_named_sample,
+    most_likely_samples,
+    of_one_channel,
+    of_separate_sensors,
+    samples_of_one,
+    unit_names,
+)
 from drivers.can.questions import CanQuestions
-from drivers.can.sniff import of_another_stream, of_one_channel
+from drivers.can.sniff import of_another_stream
 from drivers.names import LONGEST_NAME, message_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import LONGEST_UNIT, Values, by_name, is_waveform_rate, quoted, type_by_unit
@@ -141,7 +146,9 @@ class DbcQuestions(CanQuestions):
 
     def stated(self, answers: Answers) -> Collection[str]:
         """See `BusQuestions.stated`."""
-        known = {"message", "signals", "consecutive", "counter-counts"}
+        known = {"message", "signals", "counter-counts"}
+        if not answers.get("consecutive") or all(map(is_named_sample, self._by_channel(answers))):
+            known.add("consecutive")  # else it is a guess, whatever the file states of each signal
         if self._messages(answers)[answers["message"]].cycle_time:
             known.add("rate")
         units = self._units(answers)
@@ -261,6 +268,8 @@ class DbcQuestions(CanQuestions):
         if answers.get("consecutive"):
             for name in beside_samples(answers["signals"]):
                 yield f"# {name} is left out: it {of_another_stream(in_frame)}"
+            if answers.get("counter-counts") != "samples" and "consecutive" not in self.stated(answers):
+                yield from of_separate_sensors(self._by_channel(answers))
         else:
             yield from of_one_channel(answers["signals"])
         yield from self._other_pages(answers)

@@ -57,6 +57,7 @@ class SignalTraffic:
         last: the last value in its unit; NaN if none came.
         least: the least one.
         most: the largest one.
+        mean: the mean of all.
         stated: least and largest value by the DBC file; None where it states none.
         outside: how many frames had a value beyond these that has no name.
 
@@ -68,6 +69,7 @@ class SignalTraffic:
         self.name, self.unit = str(signal.name), str(signal.unit or "")
         self.frames = 0
         self.last = self.least = self.most = math.nan
+        self.mean = self._squares = 0.0
         self.unsigned = never_negative(signal)
         cell = signal_field(signal)
         length = int(message.length)
@@ -107,6 +109,16 @@ class SignalTraffic:
         steady = sum(many for many, _ in others) <= _FEW * self.frames
         begins_again = any(least <= step for _, least in others)
         return step if 0 < step <= int(self._mask) // 2 and steady and not begins_again else None
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation of its values: the RMS about their mean."""
+        return math.sqrt(self._squares / self.frames) if self.frames else 0.0
+
+    @property
+    def resolution(self) -> float:
+        """What one count of it is worth."""
+        return abs(self._scale)
 
     @property
     def counts(self) -> bool:
@@ -198,6 +210,11 @@ class SignalTraffic:
         rounding = 0.5 * abs(self._scale)
         self.outside += int((unnamed < least - rounding).sum()) if least is not None else 0
         self.outside += int((unnamed > most + rounding).sum()) if most is not None else 0
+        # Of the values before and of these, each about its own mean: sums of squares would lose the digits.
+        apart = float(values.mean()) - self.mean
+        share = len(values) / (self.frames + len(values))
+        self._squares += float(values.var()) * len(values) + apart**2 * self.frames * share
+        self.mean += apart * share
         self.frames += len(values)
         self.last = float(values[-1])
         self.least = float(np.fmin(self.least, values.min()))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import logging
-import re
 import subprocess
 import time
 from pathlib import Path
@@ -13,6 +12,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
+from drivers.can.numbered import (
+    Level,
+    is_named_sample,
+    levels_apart,
+    most_likely_samples,
+    numbered,
+    of_one_channel,
+    of_separate_sensors,
+    samples_of_one,
+)
 from drivers.can.other_source import other_sources
 from drivers.names import CAN, bus_name, message_stream, unused
 from drivers.sniffing import (
@@ -539,6 +548,8 @@ class _Report(NamedTuple):
                             "last": signal.last,
                             "min": signal.least,
                             "max": signal.most,
+                            "mean": signal.mean,
+                            "deviation": signal.deviation,
                             "dbc_min": signal.stated[0],
                             "dbc_max": signal.stated[1],
                             "doubt": signal.doubt,
@@ -603,13 +614,15 @@ class _Report(NamedTuple):
         assert rate_hz is not None and self.dbc_file is not None  # noqa: S101, PT018 - for the type checker
         name = unused(message_stream(message.name), taken)
         counter = message.counter
-        samples = {s.name: [s.name] for s in channels}
+        samples, is_guess = _likely_samples(message, channels)
         if counter is None and (counter := _counter_of_samples(message)) is not None:
             together = numbered([s.name for s in channels]).items()
             samples = {stem: names for stem, names in together if len(names) == counter.step}
+            is_guess = False
         read = [s for s in channels if any(s.name in names for names in samples.values())]
         first = {name: next(s for s in channels if s.name == names[0]) for name, names in samples.items()}
         in_frame = len(next(iter(samples.values())))
+        assumed = "    # assumed" * is_guess
         return [
             f"[streams.{name}]",
             f"bus = {quoted(bus)}",
@@ -624,8 +637,12 @@ class _Report(NamedTuple):
             else f"counter = {{ signal = {quoted(counter.name)}, "
             f'counts = "{"frames" if counter.counts else "samples"}" }}',
             "channels = [",
-            *(f"  {{ name = {quoted(one)}, signals = {_array(names)} }}," for one, names in samples.items()),
+            *(
+                f"  {{ name = {quoted(one)}, signals = {_array(names)} }},{assumed}"
+                for one, names in samples.items()
+            ),
             "]",
+            *(of_separate_sensors(samples) if is_guess else ()),
             *(
                 f"# {s.name} is left out: {_why_left_out(s)}"
                 for s in measured
@@ -642,6 +659,18 @@ class _Report(NamedTuple):
                 values={one: Values(s.unsigned, s.least, s.most) for one, s in first.items()},
             ),
         ]
+
+
+def _likely_samples(
+    message: MessageTraffic, channels: Sequence[SignalTraffic]
+) -> tuple[dict[str, list[str]], bool]:
+    """Signals of each channel as ``daqsvc new`` takes them, and whether that is a guess."""
+    names = [one.name for one in channels]
+    levels = {one.name: Level(one.frames, one.mean, one.deviation, one.resolution) for one in channels}
+    samples = samples_of_one(most_likely_samples(channels, names))
+    if not samples or levels_apart(message.signals, names, levels):
+        return {name: [name] for name in names}, False
+    return samples, not all(is_named_sample(stem) for stem in samples)
 
 
 def _counter_of_samples(message: MessageTraffic) -> SignalTraffic | None:
@@ -673,32 +702,6 @@ def _why_left_out(signal: SignalTraffic) -> str:
 CLOCK = "it rises all the time, as a clock does"
 STATE = f'its values have names, as states have: see "A state or an enum signal" of {documented_in("alarms")}'
 """Why a signal is no measured value, and where what to do with it is described."""
-
-
-def of_one_channel(signals: Sequence[str]) -> Iterator[str]:
-    """A comment on signals that may be samples of one channel in a frame."""
-    for stem, of_one in numbered(signals).items():
-        channel = f"{{ name = {quoted(stem)}, signals = [{', '.join(map(quoted, of_one))}] }}"
-        yield f"# If these are samples of one channel: {channel}, and {len(of_one)} times the rate."
-
-
-def numbered(signals: Sequence[str]) -> dict[str, list[str]]:
-    """Signals whose names differ in a last 0, 1 and so on only, or 1, 2, by what they have in common."""
-    stems: dict[str, list[str]] = {}
-    for name in signals:
-        if match := re.fullmatch(r"(.*[^0-9_])_?(\d+)", name):
-            stems.setdefault(match[1], []).append(name)
-    return {stem: names for stem, names in stems.items() if len(names) > 1 and _in_a_row(names)}
-
-
-def _in_a_row(names: Sequence[str]) -> bool:
-    first, *_ = numbers = [number_of(name) for name in names]
-    return first < 2 and numbers == list(range(first, first + len(numbers)))
-
-
-def number_of(name: str) -> int:
-    """The number that a name ends in."""
-    return int(re.sub(r".*[^0-9]", "", name))
 
 
 def _id(frame_id: int, *, extended: bool) -> str:

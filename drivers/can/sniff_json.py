@@ -69,6 +69,8 @@ class DbcSignalFigures(TypedDict):
         last: the last value.
         min: the least value.
         max: the greatest value.
+        mean: the mean of the values.
+        deviation: the standard deviation of the values, their RMS about the mean.
         dbc_min: the least value by the DBC file; null if it states none.
         dbc_max: the greatest value by the DBC file; null if it states none.
         doubt: what is strange about its values if the file is that of the device; empty if nothing is.
@@ -84,6 +86,8 @@ class DbcSignalFigures(TypedDict):
     last: float
     min: float
     max: float
+    mean: float
+    deviation: float
     dbc_min: float | None
     dbc_max: float | None
     doubt: str

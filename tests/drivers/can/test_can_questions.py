@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,18 @@ def new(folder: Path, dbc: str, *more: str) -> dict[str, Any]:
 def layout_of(tables: dict[str, Any]) -> dict[str, Any]:
     [stream] = tables["streams"].values()
     return stream["layout"] | {"rate_hz": stream["rate_hz"]}
+
+
+def test_names_that_state_samples_are_no_guess(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of other names only a counter of samples shows it."""
+    for named, is_guess in ((GEARBOX, True), (re.sub("(A[XY])_", r"\1Sample_", GEARBOX), False)):
+        layout = layout_of(new(tmp_path, named))
+        said = capsys.readouterr().out
+        assert [len(one["signals"]) for one in layout["channels"]] == [2, 2]
+        assert (", channels" in said.partition("Assumed, ")[2].partition(". ")[0]) == is_guess
+        text = (tmp_path / "new.toml").read_text("utf-8")
+        assert text.count('_1"] },  # assumed') == 2 * is_guess
+        assert ('# If these are separate sensors: { name = "A' in text) == is_guess
 
 
 @pytest.mark.parametrize("signals", ["AX_0, AY_0", "AX_0, Supply"])

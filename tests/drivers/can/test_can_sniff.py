@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import math
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -262,6 +264,8 @@ def test_a_page_is_proposed_at_its_own_rate(tmp_path: Path, signals: tuple[str, 
                             "unit": "",
                             "min": 0.0,
                             "max": 1.0,
+                            "mean": 0.5,
+                            "deviation": 0.3,
                             "doubt": "",
                         }
                         for n, f, m in heard
@@ -1056,6 +1060,65 @@ def test_a_counter_of_samples_is_found_and_shows_which_signals_are_samples(
     assert "# Temp is left out: it comes once a frame, the channels have 2 samples in it" in shown
     assert "Temp" in said.partition("Not read")[2]
     assert "Tick grows by 5 and not by 1 from frame to frame. Remedy: correct" in capsys.readouterr().err
+
+
+BEARINGS = """VERSION ""
+BU_: A
+BO_ 810 Beschl: 8 A
+ SG_ Beschl_0 : 0|16@1- (0.001,0) [0|0] "g" A
+ SG_ Beschl_1 : 16|16@1- (0.001,0) [0|0] "g" A
+ SG_ Beschl_2 : 32|16@1- (0.001,0) [0|0] "g" A
+ SG_ Count : 48|8@1+ (1,0) [0|0] "" A
+"""
+"""Numbered signals of vibration: by their names samples of one channel, or separate sensors."""
+
+
+def vibrating(*amplitudes_g: float) -> Callable[[UnixBus, int], None]:
+    def send(bus: UnixBus, number: int) -> None:
+        parts = [round(1000 * each * math.sin(1.7 * number + k)) for k, each in enumerate(amplitudes_g)]
+        payload = struct.pack("<3hBB", *parts, number % 256, 0)
+        bus.send(can.Message(arbitration_id=810, is_extended_id=False, data=payload))
+
+    return send
+
+
+@pytest.mark.usefixtures("hub")
+@pytest.mark.parametrize(
+    ("levels", "channels"),
+    [((0.4, 0.4, 0.4), ["Beschl"]), ((0.08, 0.42, 1.2), ["Beschl_0", "Beschl_1", "Beschl_2"])],
+)
+def test_numbered_signals_of_different_levels_are_separate_sensors_and_else_a_guess(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    levels: tuple[float, ...],
+    channels: list[str],
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    (tmp_path / "b.dbc").write_text(BEARINGS)
+    with talking(tmp_path / "bus", vibrating(*levels)):
+        assert main(words(tmp_path, "--seconds", "0.5", "--json", "--dbc", f"{tmp_path / 'b.dbc'}")) == 0
+        fragment = figures(capsys.readouterr().out)["machine_file"]
+        written = new(tmp_path, "--bus=can-dbc", "--dbc=b.dbc", "--rate=600")
+        said = capsys.readouterr().out
+        (tmp_path / "new.toml").rename(tmp_path / "guess.toml")
+        one = only_stream(new(tmp_path, "--bus=can-dbc", "--dbc=b.dbc", "--rate=600", "--consecutive=yes"))
+    text, as_told = ((tmp_path / name).read_text("utf-8") for name in ("guess.toml", "new.toml"))
+    assert [each["name"] for each in one["layout"]["channels"]] == ["Beschl"]
+    assert "assumed" not in as_told.partition("channels = [")[2].partition("\n]")[0]
+    for tables in (written, tomllib.loads(fragment)):
+        assert [each["name"] for each in only_stream(tables)["layout"]["channels"]] == channels
+    assert names_in(written) == names_in(tomllib.loads(fragment))
+    is_guess = len(channels) == 1
+    lines = [line for line in (text + fragment).splitlines() if line.startswith('  { name = "Beschl')]
+    assert ["# assumed" in line for line in lines] == [is_guess] * len(lines)
+    how = '# If these are separate sensors: { name = "Beschl_0", signals = ["Beschl_0"] } and so on'
+    assert (how in text, how in fragment) == (is_guess, is_guess)
+    [assumed] = [line for line in said.splitlines() if line.startswith("Assumed, as nobody has stated it: ")]
+    assert ("channels" in assumed) == is_guess
+    head = comments(tmp_path / "guess.toml")
+    assert ("are read as 3 samples of Beschl: a guess by their names." in head) == is_guess
+    assert ("are read as 3 channels, as their levels differ" in head) != is_guess
 
 
 @pytest.mark.usefixtures("hub")
