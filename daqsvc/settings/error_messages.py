@@ -303,7 +303,9 @@ class ErrorFormatter:
     def _too_long(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         most = context["max_length"]
         if isinstance(value_at(self._document, path), str):
-            return f"must be {counted(most, 'character')}", self._write_example(path)
+            # Of one character there can only be none fewer, which is empty.
+            words = f"must have {most} characters at most" if most > 1 else "must be 1 character"
+            return words, self._write_example(path)
         if most > _MOST_IN_A_ROW:
             return f"has more than {most:,} entries", "leave some out, or watch the rest with another service"
         return f"must have {counted(most, 'value')}", self._write_example(path)

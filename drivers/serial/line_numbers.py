@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.units import QUALIFIER
+from drivers.serial.settings import LONGEST_BESIDE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +26,10 @@ _UNIT = rf"(?:°|°?{_NAME}(?:/{_NAME})?|1/[A-Za-z]+)(?i:(?: ?{QUALIFIER})?)"
 _WITH_UNIT: Mapping[str, re.Pattern[str]] = {
     mark: re.compile(rf"({number.pattern})({_UNIT}) *") for mark, number in NUMBER.items()
 }
-_NAMED = re.compile(r" *([^\W\d][\w.-]{0,13}[=:])(?=[ +.,0-9-]|$|nan|inf|ol|n/?a|none|null)", re.IGNORECASE)
+_NAMED = re.compile(
+    rf" *([^\W\d][\w.-]{{0,{LONGEST_BESIDE - 2}}}[=:])(?=[ +.,0-9-]|$|nan|inf|ol|n/?a|none|null)",
+    re.IGNORECASE,
+)
 _UNPRINTED = re.compile(
     "(?<=[A-Za-z0-9])[\x80-\x9f]{1,2}(?![\x80-\x9f])|(?<![\x80-\x9f])[\x80-\x9f]{1,2}(?=[A-Za-z])|[\xa0\u202f\t]"
 )
@@ -87,7 +91,7 @@ def parts_of(text: str, decimal: str) -> tuple[str, str] | None:
     name = name_before(text)
     bare = text.lstrip(BLANK)[len(name) :]
     unit = "" if NUMBER[decimal].fullmatch(bare) else unit_behind(bare, decimal) or None
-    return None if unit is None else (name, unit)
+    return None if unit is None or len(unit) > LONGEST_BESIDE else (name, unit)
 
 
 def name_before(text: str) -> str:

@@ -27,6 +27,7 @@ from drivers.serial.line_numbers import (
     parts_of,
     text_of,
 )
+from drivers.serial.settings import LONGEST_BESIDE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -56,7 +57,7 @@ _LEAST_SWINGING, _LEAST_DIFFERENT, _SWINGING = 16, 4, 0.1
 """A column may be a vibration from so many values on, different ones among them, and share of steps over
 the mean."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
-_PREFIX = re.compile(r"[!$]?(?!\d)[\w-]{1,15}")
+_PREFIX = re.compile(rf"(?=.{{1,{LONGEST_BESIDE}}}$)[!$]?(?!\d)[\w-]+")
 _MESSAGES = frozenset(
     {"err", "error", "fail", "failed", "fault", "warn", "warning", "info", "debug", "timeout"}
 )

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 LONGEST_PAYLOAD = 4096
 LONGEST_SYNC_WORD = 8
+LONGEST_BESIDE = 32
+"""Characters in front of a number, behind it, or of the first field of a line."""
 UNITS_PER_S: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
 """What the time of a line may be in, the coarsest first."""
 _OF_NUMBERS = frozenset("0123456789+-., ")
@@ -277,9 +279,8 @@ def _behind(text: str) -> str:
     return _beside(text, "behind", "mm/s")
 
 
-_LONGEST_BESIDE = 16
-_InFront = Annotated[str, AfterValidator(_in_front), Field(min_length=1, max_length=_LONGEST_BESIDE)]
-_Behind = Annotated[str, AfterValidator(_behind), Field(min_length=1, max_length=_LONGEST_BESIDE)]
+_InFront = Annotated[str, AfterValidator(_in_front), Field(min_length=1, max_length=LONGEST_BESIDE)]
+_Behind = Annotated[str, AfterValidator(_behind), Field(min_length=1, max_length=LONGEST_BESIDE)]
 _IN_FRONT = "text in front of the number, such as its name; a line with another text there is not read"
 _BEHIND = "text behind the number, such as its unit; a line with another text there is not read"
 
@@ -339,7 +340,7 @@ class LineLayout(Layout):
         description="character between two columns; of blanks there may be several, also in front",
     )
     decimal: Literal[".", ","] = Field(default=".", description="decimal mark of the numbers")
-    prefix: Annotated[str, AfterValidator(_first_field), Field(max_length=16)] | None = Field(
+    prefix: Annotated[str, AfterValidator(_first_field), Field(max_length=LONGEST_BESIDE)] | None = Field(
         default=None,
         description="first field of each line of this stream, in UTF-8 or Latin-1 if it has letters beyond "
         "ASCII; lines with another one are not of it",

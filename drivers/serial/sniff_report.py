@@ -16,13 +16,12 @@ from drivers.serial.sniff_words import (
     MUST_TURN,
     NO_NUMBERS,
     UNSEEN_WIDTH,
-    WIDEST,
     absent_words,
+    cut_off,
     frames_need,
     no_number_words,
     other_lines_words,
     overrun_words,
-    printable,
     seen_width,
     sync_words,
     turn_words,
@@ -304,8 +303,8 @@ class Report(NamedTuple):
             yield self._frames(what)
 
     def _lines(self, what: TextLines) -> Iterator[str | SniffTable]:
-        shown = "\n".join(line[:WIDEST] for line in what.lines[:_SHOWN_LINES])
-        yield f"The first lines:\n{printable(shown)}"
+        shown = "\n".join(map(cut_off, what.lines[:_SHOWN_LINES]))
+        yield f"The first lines:\n{shown}"
         words = [counted(len(what.columns), "column")]
         between = "blanks" if what.separator == " " else quoted(what.separator)
         words += [f"separated by {between}"] * bool(what.separator)

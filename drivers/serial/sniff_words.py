@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 from daqsvc.documentation import documented_in
+from drivers.serial.settings import LONGEST_BESIDE
 from drivers.sniffing import quoted
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 WIDEST = 100
 """Characters of a line that are shown."""
 _BEHIND_NUMBER = re.compile(r" *[+-]?[0-9]+(?:[.,][0-9]+)? *([^0-9.,: ][^0-9]*?) *")
-_LONGEST_SUFFIX = 16
+_IN_FRONT = re.compile(r" *([^\W\d][^=:]*[=:])(?= *[+-]?[.,]?[0-9])")
 NO_NUMBERS = "No column is a number, such as 22.5 or NAME=22.5: JSON and hex are not read."
 LINES_NEED = "A stream needs a column of numbers, best beside one that counts lines or has the device's time"
 """Why nothing is proposed of lines."""
@@ -91,7 +92,7 @@ def other_lines_words(count: int, heard: int, example: str) -> str:
     """What it means that some lines are not like the others."""
     are = "is" if count == 1 else "are"
     return (
-        f"{count} of {heard} lines {are} not of this layout, e.g. {quoted(printable(example[:WIDEST]))}: "
+        f"{count} of {heard} lines {are} not of this layout, e.g. {quoted(cut_off(example))}: "
         "daqsvc counts such lines, and does not read them"
     )
 
@@ -115,8 +116,28 @@ def absent_words(name: str, absent: int, heard: int, text: str) -> str:
 
 def no_number_words(texts: Mapping[str, str]) -> str:
     """What it means that columns, by name, are no numbers."""
+    too_long = {name: words for name, text in texts.items() if (words := _too_long_words(name, text))}
+    others = {name: text for name, text in texts.items() if name not in too_long}
+    return " ".join([*too_long.values(), *([_no_number_words(others)] if others else [])])
+
+
+def _too_long_words(name: str, text: str) -> str:
+    """What it means that more is around the number of a column than its keys can state; empty if not so."""
+    named = _IN_FRONT.match(text)
+    behind = _BEHIND_NUMBER.fullmatch(text[named.end() if named else 0 :])
+    for found, where, key in ((named, "in front of", "prefix"), (behind, "behind", "suffix")):
+        if found is not None and len(found[1]) > LONGEST_BESIDE:
+            return (
+                f"Column {name} is left out: {quoted(printable(found[1]))} {where} its number has "
+                f"{len(found[1])} characters, and {key} takes {LONGEST_BESIDE} at most. If it is to be "
+                "watched, have the device send a shorter text."
+            )
+    return ""
+
+
+def _no_number_words(texts: Mapping[str, str]) -> str:
     name, text = next(iter(texts.items()))
-    example = quoted(printable(text[:WIDEST]))
+    example = quoted(cut_off(text))
     if len(texts) == 1:
         begin = (
             f"Column {name} is left out, as not every line has a number there, but e.g. {example}. If it is"
@@ -128,10 +149,15 @@ def no_number_words(texts: Mapping[str, str]) -> str:
         )
     beside = _BEHIND_NUMBER.fullmatch(text)
     remedy = "have the device send decimal numbers"
-    if beside is not None and len(beside[1]) <= _LONGEST_SUFFIX:
+    if beside is not None:
         suffix = quoted(printable(beside[1]))
         remedy = f"write suffix = {suffix} in its channel if this is always there, or {remedy}"
     return f"{begin} to be watched, {remedy}."
+
+
+def cut_off(text: str) -> str:
+    """The begin of a text of a device, with a sign where more of it follows."""
+    return printable(text[:WIDEST]) + "..." * (len(text) > WIDEST)
 
 
 def printable(text: str) -> str:

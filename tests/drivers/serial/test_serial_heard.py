@@ -184,6 +184,46 @@ def test_sniff_and_new_take_the_width_of_a_counter_that_was_seen(
     assert any("c1 counts lines" in line for line in HeardOnSerial(found.figures, SerialQuestions()).lines)
 
 
+@pytest.mark.parametrize("characters", [15, 16, 17, 31, 32])
+def test_a_name_in_front_of_a_number_is_found_as_long_as_a_prefix_can_be(
+    tmp_path: Path, characters: int
+) -> None:
+    name = "Lagertemperatur_des_vorderen_Lagers_der_Pumpe"[: characters - 1] + "="
+    found = of_lines(f"{{n}};{{v:.2f}};{name}{{t:.1f}} °C")
+    file, text = written(found, tmp_path / "m.toml")
+    for one in (file, tomllib.loads(found.fragment)):
+        channels = only_stream(one)["layout"]["channels"]
+        assert [channel.get("prefix") for channel in channels] == [None, name]
+    assert "left out" not in text
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        (f"{'T' * 32}={{t:.1f}} °C", f'"{"T" * 32}=" in front of its number has 33 characters, and prefix'),
+        (f"{{t:.1f}} {'C' * 33}", f'"{"C" * 33}" behind its number has 33 characters, and suffix'),
+        (f"T={{t:.1f}} {'C' * 33}", f'"{"C" * 33}" behind its number has 33 characters, and suffix'),
+    ],
+)
+def test_what_is_too_long_beside_a_number_is_the_reason_why_a_column_is_left_out(
+    tmp_path: Path, form: str, said: str
+) -> None:
+    found = of_lines(f"{{n}};{{v:.2f}};{form}")
+    _, text = written(found, tmp_path / "m.toml")
+    heard = (
+        f"is left out: {said} takes 32 at most. If it is to be watched, have the device send a shorter text."
+    )
+    for place in (text, found.fragment):
+        assert heard in place.replace("\n# ", " ")
+        assert "not every line" not in place
+
+
+def test_a_line_that_is_quoted_shows_that_more_of_it_follows() -> None:
+    found = of_lines("{n};" + ";".join(["{t:.1f}"] * 40))
+    shown = [one for one in found.parts if isinstance(one, str) and one.startswith("The first lines")]
+    assert all(line.endswith("...") for line in shown[0].splitlines()[1:])
+
+
 def test_of_columns_of_hex_none_is_kept_as_a_decimal_number() -> None:
     found = of_lines("{hexed}")
     assert [one["numeric"] for one in found.figures["columns"]] == [False, False, False]

@@ -152,6 +152,13 @@ def test_the_driver_is_found_by_its_name():
             'e.g. "V="',
         ),
         (
+            '{ name = "v" }',
+            f'{{ name = "v", prefix = "{"V" * 33}" }}',
+            "streams.casing.layout.channels[0].prefix",
+            "must have 32 characters at most",
+            'write prefix = "V="',
+        ),
+        (
             'column = "seq", bits = 16 }',
             'column = "seq", bits = 16, prefix = "n," }',
             "streams.casing.layout.counter.prefix",
