@@ -75,8 +75,8 @@ class DecodedBatch:
         unknown: frames by unknown id, in words, or by page where streams read other pages of a message.
         pages_of: of those that are a page of a multiplexer, which streams read other pages of that message.
         wrong_length: frames by stream, and the length of the last of them.
-        malformed: what the first piece was that should have been a frame, and why it is none; empty if there
-            was none, or it was reported before.
+        malformed: what the first piece was that should have been a frame, and why it is none; the last one
+            where all of them are none. Empty if there was none, or it was reported before.
         remedy: what to do if all pieces are like that one; empty if nothing special.
         errors: what error frames report, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
         data_frames: frames that carry data, of any stream or none.

@@ -49,6 +49,8 @@ logger = logging.getLogger(__name__)
 REMEMBERED_IDS = 64
 RECENT_NS = 10 * NS_PER_S
 """Time for which bytes that were no frame count as coming."""
+_MOST_SAID = 4
+"""Kinds of bytes that are no frame which are logged."""
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 
@@ -102,6 +104,7 @@ class SerialDriver:
         self._framing = framing_of(bus, port.streams)
         self._assemblers = {s.name: _assembler(s, port, self._unread) for s in port.streams}
         self._logged: set[str] = set()
+        self._remedies: list[str] = []
         self._faults: dict[str, str] = {}
         self.link.faults = self._faults
         self._no_frame = ""
@@ -177,15 +180,7 @@ class SerialDriver:
         for name, count in batch.notes.items():
             self.note(name, count)
         if batch.malformed or "frames_malformed" in batch.notes:
-            self._say_once(
-                "malformed",
-                NO_FRAME,
-                "%s carries bytes that are no frame; they are counted and left out%s. If it is all of them, "
-                "%s",
-                self.link.name,
-                f"; {batch.malformed}" if batch.malformed else "",
-                batch.remedy or COMPARE,
-            )
+            self._say_what_is_no_frame(batch)
             self._come_in_place(batch)
         for name, count in batch.unknown.items():
             self._count_unknown(name, count)
@@ -212,6 +207,21 @@ class SerialDriver:
         for name, assembler in self._assemblers.items():
             with sparing_others(self.link, name, self.counters):
                 assembler.tick(drained_ns)
+
+    def _say_what_is_no_frame(self, batch: DecodedBatch) -> None:
+        """Log what is wrong with the first piece that is no frame, and what is wrong with all later ones."""
+        is_other = bool(batch.malformed) and batch.remedy not in self._remedies
+        # Noise is of all sorts: it must not fill the log.
+        if self._remedies and (not is_other or len(self._remedies) >= _MOST_SAID):
+            return
+        self._remedies.append(batch.remedy)
+        logger.warning(
+            "%s carries bytes that are no frame; they are counted and left out%s. If it is all of them, %s",
+            self.link.name,
+            f"; {batch.malformed}" if batch.malformed else "",
+            batch.remedy or COMPARE,
+            extra=coded(NO_FRAME),
+        )
 
     def _come_in_place(self, batch: DecodedBatch) -> None:
         """State what comes in place of the frames of streams, until these come."""

@@ -8,6 +8,7 @@ runs per frame that is of a known stream. The virtual bus wraps its frames with 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -28,6 +29,13 @@ SHOWN_BYTES = 16
 """Bytes that are shown of what is no frame."""
 COMPARE = "compare baud, parity, framing and checksum with the device's"
 """What to do about bytes that show nothing more."""
+
+
+_IN_A_ROW = 3
+"""Number of pieces in a row from which on all of them may be no frame."""
+_JUDGED_BY = 4
+"""Number of the last pieces of a batch by which is judged what is wrong with all of them."""
+_MOST_KINDS = 16
 
 
 class NoFrame(NamedTuple):
@@ -152,6 +160,9 @@ class DelimitedFraming(ABC):
         self._padding = padding
         self._whole = whole
         self._is_reported = False
+        # What is wrong with the pieces since the last frame, by its remedy; and which of it was reported.
+        self._wrong: Counter[str] = Counter()
+        self._reported_of_these: str | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -183,27 +194,67 @@ class DelimitedFraming(ABC):
             # The end of a frame that began before the port was opened is no fault.
             skipped = int(cut_off and not in_step[0])
             self._astray = count_steps(batch, in_step[skipped:], astray=self._astray)
-            strange = np.flatnonzero(~in_step[skipped:])
-            if len(strange) and not self._is_reported:
-                first = int(strange[0]) + skipped
-                # As they came: who sorts pieces may change the buffer.
-                came = kept.tobytes() + data
-                piece = came[pieces.starts[first] : pieces.stops[first]]
-                batch.malformed, batch.remedy = self._why_no_frame(piece)
-                self._is_reported = True
+            self._report(batch, pieces.keep(slice(skipped, None)), in_step[skipped:], kept, data)
         self._astray |= overlong
         return batch
+
+    def _report(
+        self,
+        batch: DecodedBatch,
+        pieces: Pieces,
+        in_step: NDArray[np.bool_],
+        kept: NDArray[np.uint8],
+        data: bytes,
+    ) -> None:
+        """Report what is wrong with the first piece that is no frame, and later with what is none now.
+
+        A header that comes now and then is no frame either, and shows nothing of the lines behind it.
+        """
+        strange, sound = np.flatnonzero(~in_step), np.flatnonzero(in_step)
+        if not len(strange):
+            self._begin_anew(sound)
+            return
+        # As they came: who sorts pieces may change the buffer.
+        came = kept.tobytes() + data
+
+        def why_no_frame(place: int, which: str) -> NoFrame:
+            return self._why_no_frame(came[pieces.starts[place] : pieces.stops[place]], which)
+
+        first = None if self._is_reported else why_no_frame(int(strange[0]), "the first")
+        if first is not None:
+            batch.malformed, batch.remedy = first
+            self._is_reported = True
+        self._begin_anew(sound)
+        if len(sound):
+            strange = strange[strange > sound[-1]]
+        elif first is not None:
+            self._reported_of_these = first.remedy
+        for place in strange[-_JUDGED_BY:].tolist():
+            last = why_no_frame(place, "the last")
+            if len(self._wrong) == _MOST_KINDS:
+                self._wrong.clear()
+            self._wrong[last.remedy] += 1
+            is_most = self._wrong[last.remedy] == max(self._wrong.values())
+            if self._wrong.total() >= _IN_A_ROW and is_most and last.remedy != self._reported_of_these:
+                batch.malformed, batch.remedy = last
+                self._reported_of_these = last.remedy
+
+    def _begin_anew(self, sound: NDArray[np.int64]) -> None:
+        """What was wrong before a frame is of no use for what comes behind it."""
+        if len(sound):
+            self._wrong.clear()
+            self._reported_of_these = None
 
     def ends_in(self, chunk: bytes, heard: int) -> bool:
         """See `Framing.ends_in`."""
         del heard
         return self._delimiter in chunk
 
-    def _why_no_frame(self, piece: bytes) -> NoFrame:
-        """What a piece is that should have been a frame, and what is wrong with it."""
+    def _why_no_frame(self, piece: bytes, which: str = "the first") -> NoFrame:
+        """What a piece is that should have been a frame, the first or the last, and what is wrong with it."""
         begin = piece[:SHOWN_BYTES].hex(" ")
         shown = f"{begin}{' ...' if len(piece) > SHOWN_BYTES else ''}"
-        return NoFrame(f"the first has {len(piece)} bytes: {shown}")
+        return NoFrame(f"{which} has {len(piece)} bytes: {shown}")
 
     def _why_no_end(self, begin: bytes) -> NoFrame:
         """What bytes are that have no delimiter within the longest frame, and what is wrong with them."""

@@ -412,33 +412,33 @@ class LineFraming(DelimitedFraming):
         ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
         return [line + end for line, end in zip(lines, ends, strict=True)]
 
-    def _why_no_frame(self, piece: bytes) -> NoFrame:
+    def _why_no_frame(self, piece: bytes, which: str = "the first") -> NoFrame:
         line = text_of(piece)
         shown = piece[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")
         shown = line[:SHOWN_CHARACTERS] if is_text(line) else shown
-        first_line = f'the first line is "{shown}{"..." if len(piece) > SHOWN_CHARACTERS else ""}"'
+        quote = f'{which} line is "{shown}{"..." if len(piece) > SHOWN_CHARACTERS else ""}"'
         if not is_text(line):
             why = "no text, as at another baud rate or parity, or of a device that sends no lines"
-            return NoFrame(f"{first_line}: {why}")
+            return NoFrame(f"{quote}: {why}")
         if self._checksum != "none":
             text, star, sent = piece.rpartition(b"*")
             if not star:
                 remedy = 'write checksum = "none" in the table of the bus'
-                return NoFrame(f"{first_line}: no checksum behind a *", remedy)
+                return NoFrame(f"{quote}: no checksum behind a *", remedy)
             made = b"%0*X" % (DIGITS[self._checksum], _SUMS[self._checksum](text[text[:1] in {b"$", b"!"} :]))
             if made != sent.upper():
                 why = f"checksum {sent.decode()}, its text makes {made.decode()}"
-                return NoFrame(f"{first_line}: {why}", "compare checksum with the device's")
+                return NoFrame(f"{quote}: {why}", "compare checksum with the device's")
             piece = text
         fields = fields_of(text_of(piece), self._separator)
         if None in self._by_prefix:
             why, remedy = self._codecs[self._by_prefix[None]].why_not(fields)
-            return NoFrame(f"{first_line}: {why}", remedy)
+            return NoFrame(f"{quote}: {why}", remedy)
         name = self._by_prefix.get(fields[0])
         if name is None:
-            return NoFrame(f"{first_line}: of no stream", "correct prefix and separator of the layout")
+            return NoFrame(f"{quote}: of no stream", "correct prefix and separator of the layout")
         why, remedy = self._codecs[name].why_not(fields[1:])
-        return NoFrame(f"{first_line}: {why}", remedy)
+        return NoFrame(f"{quote}: {why}", remedy)
 
     def _why_no_end(self, begin: bytes) -> NoFrame:
         shown = begin[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")

@@ -381,6 +381,38 @@ def test_why_no_samples_come_is_stated_while_lines_come_that_are_none_of_the_lay
     assert driver.link.why_silent("x") == ""
 
 
+@pytest.mark.gives("B34")
+def test_what_is_wrong_with_all_lines_now_is_stated_though_a_header_came_first(caplog: Any) -> None:
+    layout = line_layout(("seq", "x"), ("x",), counter="seq", bits=16)
+    clock, specs = DrivenClock(), [StreamSpec("x", layout, 100.0)]
+    bus = serial_bus(port="/var/lib/daqsvc/port", framing="lines")
+    driver = SerialDriver(bus, BusPort("ser0", specs, clock, lambda _: None))
+    driver.link.up()
+    framing = framing_of(bus, specs)
+    header = b"count,temp\n"
+    driver.accept(framing.cut(b"0,1\n" + header + b"65534,1\n"))
+    driver.accept(framing.cut(header))
+    assert '"count,temp"' in driver.link.why_silent("x")
+    for count in range(65_536, 65_560):
+        driver.accept(framing.cut(header * (count % 8 == 0) + b"%d,1\n" % count))
+    assert 'the last line is "65' in driver.link.why_silent("x")
+    assert "by its bits in the file 65535 at most" in driver.link.why_silent("x")
+    said = [record.message for record in caplog.records if "no frame" in record.message]
+    assert len(said) == 2
+    assert '"count,temp"' in said[0]
+    assert said[1].endswith("correct bits of counter")
+
+
+def test_noise_of_all_sorts_does_not_fill_the_log(caplog: Any) -> None:
+    clock, specs = DrivenClock(), [StreamSpec("x", LINE, 100.0)]
+    bus = serial_bus(port="/var/lib/daqsvc/port", framing="lines")
+    driver = SerialDriver(bus, BusPort("ser0", specs, clock, lambda _: None))
+    framing = framing_of(bus, specs)
+    for columns in range(2, 50):
+        driver.accept(framing.cut(b"7\n" + 4 * (b",".join([b"1"] * columns) + b"\n")))
+    assert 1 < sum("no frame" in record.message for record in caplog.records) <= 4
+
+
 async def test_a_port_is_not_silent_while_its_kernels_are_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
