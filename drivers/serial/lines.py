@@ -427,7 +427,7 @@ class LineFraming(DelimitedFraming):
                 return NoFrame(f"{quote}: no checksum behind a *", remedy)
             made = b"%0*X" % (DIGITS[self._checksum], _SUMS[self._checksum](text[text[:1] in {b"$", b"!"} :]))
             if made != sent.upper():
-                why = f"checksum {sent.decode()}, its text makes {made.decode()}"
+                why = f"checksum {text_of(sent)}, its text makes {made.decode()}"
                 return NoFrame(f"{quote}: {why}", "compare checksum with the device's")
             piece = text
         fields = fields_of(text_of(piece), self._separator)

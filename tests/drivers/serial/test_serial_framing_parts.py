@@ -328,7 +328,12 @@ def test_the_other_decimal_mark_is_named():
 
 
 @pytest.mark.parametrize(
-    ("piece", "said"), [(b"1,z*00", "checksum 00, its text makes 67"), (b"1,z", "no checksum behind a *")]
+    ("piece", "said"),
+    [
+        (b"1,z*00", "checksum 00, its text makes 67"),
+        (b"1,z*\xb70", "checksum \xb70, its text makes 67"),
+        (b"1,z", "no checksum behind a *"),
+    ],
 )
 def test_a_checksum_is_quoted_with_what_it_would_be(piece, said):
     # What can be read is a frame, if a corrupt one.
