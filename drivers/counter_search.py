@@ -17,6 +17,7 @@ LEAST_COUNTS = 8
 _BYTE_STEPS, _WORD_STEPS = 256, 65_536
 _NEARLY_ALL = 0.9
 _SORTED = 199
+"""Pairs of frames, evenly spread, that show which step is the usual one."""
 
 
 class FrameCounter(NamedTuple):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from drivers.can.errors import ErrorCounts
+from drivers.can.settings import PRIORITY
 from drivers.frames import DecodedBatch
 
 if TYPE_CHECKING:
@@ -32,8 +33,6 @@ BIT_RATE_SWITCH = 0x01
 ERROR_PASSIVE_SENDER = 0x02
 FD = 0x04
 """Flags of CAN FD frames (``CANFD_BRS``, ``CANFD_ESI`` and ``CANFD_FDF``)."""
-PRIORITY = 0x1C00_0000
-"""Bits of a 29-bit id that state how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
 LONGEST = 64
 

@@ -24,7 +24,7 @@ from daqsvc.settings.packing import counted, packed_room, valid_raw
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.units import factor_between, same_unit, unit_of
-from drivers.can.settings import CanBus, DbcLayout, PlainLayout
+from drivers.can.settings import PRIORITY, CanBus, DbcLayout, PlainLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -39,9 +39,6 @@ SHORTEST_WRAP_S = 0.040
 
 LEAST_COUNTER_BITS = 4
 """A narrower counter wraps within a few frames."""
-
-PRIORITY = 0x1C00_0000
-"""Bits of a J1939 id that state how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
 _OF_LINUX = re.compile(r"[^/\s]{1,15}").fullmatch
 """Names that a network interface can have (IFNAMSIZ in linux/if.h)."""

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rounding import counted
-from drivers.can.batches import ERROR, EXTENDED, EXTENDED_ID, PRIORITY, REMOTE, by_id
+from drivers.can.batches import ERROR, EXTENDED, EXTENDED_ID, REMOTE, by_id
 from drivers.can.checks import LEAST_COUNTER_BITS
 from drivers.can.dbc import j1939_valid, never_negative, selecting_values, signal_field, signals_by_page
-from drivers.can.settings import CAN_FD_LENGTHS
+from drivers.can.settings import CAN_FD_LENGTHS, PRIORITY
 from drivers.counter_search import LEAST_COUNTS
 from drivers.fields import FieldGroup, LayoutError
 from drivers.sniffing import span

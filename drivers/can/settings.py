@@ -17,6 +17,8 @@ from daqsvc.settings.section import MOST_CHANNELS, InSchema, Name, Section, Text
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
+PRIORITY = 0x1C00_0000
+"""Bits of a J1939 id that state how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
 
 def _payload_length(length: int) -> int:

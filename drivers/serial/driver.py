@@ -49,7 +49,7 @@ logger = logging.getLogger(__name__)
 REMEMBERED_IDS = 64
 RECENT_NS = 10 * NS_PER_S
 """Time for which bytes that were no frame count as coming."""
-_MOST_SAID = 4
+_MOST_LOGGED = 4
 """Kinds of bytes that are no frame which are logged."""
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
@@ -212,7 +212,7 @@ class SerialDriver:
         """Log what is wrong with the first piece that is no frame, and what is wrong with all later ones."""
         is_other = bool(batch.malformed) and batch.remedy not in self._remedies
         # Noise is of all sorts: it must not fill the log.
-        if self._remedies and (not is_other or len(self._remedies) >= _MOST_SAID):
+        if self._remedies and (not is_other or len(self._remedies) >= _MOST_LOGGED):
             return
         self._remedies.append(batch.remedy)
         logger.warning(

@@ -91,13 +91,5 @@ def test_an_enum_signal_raises_the_alarm_of_its_state(state, level):
     (sensor,), (alarm,) = example["sensors"], example["alarms"]
     assert TrendValue.model_validate(sensor).unit == "1"
     rig = AlarmRig(alarm_rule(LevelAlarm.model_validate(alarm)))
-    for _ in range(5):
-        rig.take(
-            detector="levels/drive-state",
-            decision="normal",
-            statistics={"value": state},
-            units={"value": "1"},
-            quality="good",
-            sensors=("drive-state",),
-        )
+    rig.take_state("drive-state", state, times=5)
     assert rig.status("drive-state").level.label == level

@@ -90,15 +90,7 @@ def test_the_message_of_an_alarm_has_the_name_of_the_state(
 ) -> None:
     [alarm] = machine.alarms
     rig = AlarmRig(alarm_rule(alarm, machine.value_names))
-    for _ in range(2):
-        rig.take(
-            detector="levels/drive-state",
-            decision="normal",
-            statistics={"value": state},
-            units={"value": "1"},
-            quality="good",
-            sensors=("drive-state",),
-        )
+    rig.take_state("drive-state", state, times=2)
     level = "danger limit 1.5" if state > 1.5 else "alert limit 0.5"
     assert f"value of drive-state is {shown}, {level}" in rig.status("drive-state").summary
 

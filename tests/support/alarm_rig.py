@@ -88,6 +88,18 @@ class AlarmRig:
         self.last = Diagnosis(t_ns=self.clock.t_ns, **fields)
         return self.told(self.manager.take(self.last))
 
+    def take_state(self, sensor: str, value: float, times: int) -> None:
+        """A trend value without a unit, so many times in a row."""
+        for _ in range(times):
+            self.take(
+                detector=f"levels/{sensor}",
+                decision="normal",
+                statistics={"value": value},
+                units={"value": "1"},
+                quality="good",
+                sensors=(sensor,),
+            )
+
     def rms(
         self,
         value: float,

@@ -317,8 +317,7 @@ def _speed_in_samples(draft: MachineFile) -> Iterator[Finding]:
                     watched.setdefault(name, set()).add(alarm.measure)
     for stream, table in draft.streams.items():
         with suppress(UnusableValueError):
-            rate_hz = table.rate_hz
-            if rate_hz >= 2.0 * once_hz:
+            if not is_below_1x(draft, stream):
                 continue
             there = [one for one in draft.sensors if one.stream == stream and one.type in _SAMPLED]
             if any(watched.get(one.name, set()) & set(VELOCITIES) for one in there):
@@ -332,7 +331,7 @@ def _speed_in_samples(draft: MachineFile) -> Iterator[Finding]:
                 continue
             yield Finding(
                 ("streams", stream, "rate_hz"),
-                f"shows nothing above {rate_hz / 2:g} Hz, and the machine turns at {once_hz:.4g} Hz "
+                f"shows nothing above {table.rate_hz / 2:g} Hz, and the machine turns at {once_hz:.4g} Hz "
                 f"({speed_rpm:g} rpm). RMS and peak of {', '.join(moving)} do not show its vibration",
                 show_1x(once_hz),
                 fatal=False,

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from support.examples import examples
 from support.uart_waves import sampled, wave
 
+from drivers.serial import recognise
 from drivers.serial.checksums import CHECKSUMS
 from drivers.serial.recognise import CONCLUSIVE, recognised
 from drivers.serial.recognise_frames import BinaryFrames
@@ -156,6 +157,16 @@ def test_a_header_a_prefix_texts_and_a_checksum_are_seen() -> None:
     spoilt = recognised(sent.replace(b"*", b"*F").replace(b"\r", b"")[:-2]).what
     assert isinstance(spoilt, TextLines)
     assert spoilt.checksum != "xor"
+
+
+def test_text_that_is_certain_is_not_searched_for_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search takes seconds where a port sends fast."""
+    searched: list[int] = []
+    monkeypatch.setattr(recognise, "sync_frames", lambda data: searched.append(len(data)))
+    assert isinstance(recognised(b"".join(b"%d,%d.5\n" % (n, n % 7) for n in range(200))).what, TextLines)
+    assert not searched
+    recognised(bytes(range(256)) * 4)
+    assert searched == [1024]
 
 
 def test_a_line_with_another_number_of_columns_is_counted() -> None:
