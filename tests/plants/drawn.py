@@ -4,7 +4,7 @@
 
 The seed, the ranges and what a draw is rejected for were committed before anything was evaluated. A draw is
 rejected only if it is no machine that could be run: see `_physical`. The first draw that is not rejected is
-taken, whatever the detectors say of it.
+taken, whatever the detectors say of it. Once detectors are changed with a draw in view, another seed is used.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from plants.machines import Geometry, Journal, Model, Support, stable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-_SEED = 17
+_SEED = 18
+"""Of the draw that counts. 17 was evaluated on 2026-11-29; a margin of names was chosen with it in view."""
 _MOST_DRAWS = 200
 
 _ELEMENTS = 10
