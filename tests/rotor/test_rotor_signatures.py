@@ -12,6 +12,7 @@ from support.rotor_orbits import HEALTHY, ROTOR, SPEED_RAD_S
 from daqsvc.rotor.laval import compliance, unbalance_response
 from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.rotor.synchronous.signatures import (
+    NAMED_BY_RUN_UP,
     TEMPERATURE,
     NamingRules,
     _group,
@@ -303,6 +304,19 @@ def test_a_rub_without_a_mark_is_left_out_sooner_where_1x_alone_explains_it(
         before = replace(before, fit_error=1.0)
     group = _group(scores, best, before, NamingRules(), marked=marked)
     assert ({other, "rub"} == set(group)) == (together or not modelled)
+
+
+@pytest.mark.parametrize("other", ["stiffness_loss", "unmodelled"])
+@pytest.mark.parametrize(
+    ("behind", "rules", "together"),
+    [(4.9, NamingRules(), True), (3.6, NAMED_BY_RUN_UP, False), (3.4, NAMED_BY_RUN_UP, True)],
+)
+def test_a_run_up_parts_what_is_less_far_apart(
+    other: str, behind: float, rules: NamingRules, *, together: bool
+):
+    scores = {"normal": 0.0, "rub": 100.0, other: 100.0 - behind}
+    group = _group(scores, "rub", healthy_run(healthy()), rules, marked=True)
+    assert group == (("rub", other) if together else ("rub",))
 
 
 def test_1x_that_moves_alone_is_no_stiffness_loss_where_the_mean_position_is_known():

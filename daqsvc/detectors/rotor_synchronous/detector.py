@@ -21,7 +21,7 @@ from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality.probes import RevolutionJudge, RevolutionQuality
 from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
-from daqsvc.rotor.synchronous.signatures import NAMED_BY_RUN_UP
+from daqsvc.rotor.synchronous.signatures import naming_of
 from daqsvc.rotor.synchronous.watch import RotorWatch, WatchReport, WatchRules
 
 if TYPE_CHECKING:
@@ -134,9 +134,8 @@ class RotorSynchronousDetector:
         self.ac_coupled = ac_coupled or (calibration is not None and static_position_missing(calibration))
         self._rate_hz = rate_hz
         self._reference = reference
-        self._rules = rules or WatchRules()
-        if (rotor if calibration is None else calibration.rotor).two_modes is not None:
-            self._rules = replace(self._rules, naming=NAMED_BY_RUN_UP)
+        known = rotor if calibration is None else calibration.rotor
+        self._rules = replace(rules or WatchRules(), naming=naming_of(known))
         self._listener = listener
         self._keep = keep
         self._judge = RevolutionJudge(probes)

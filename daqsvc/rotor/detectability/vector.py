@@ -18,7 +18,7 @@ import numpy as np
 from daqsvc.rotor.laval import compliance, unbalance_response
 from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.rotor.synchronous.departure import WINDOWS
-from daqsvc.rotor.synchronous.signatures import NamingRules, damping_misfit
+from daqsvc.rotor.synchronous.signatures import damping_misfit, naming_of
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN
 from daqsvc.rotor.synchronous.vectors import DC, FORWARD
 
@@ -176,7 +176,7 @@ def vector_detectability(
     spread = replace(calibration.spread, drift=drift)
     reference = float(calibration.revolutions)
     last = spread.of_means(float(WINDOWS[-1]), reference, 0.0)
-    margin = NamingRules().margin_nats
+    margin = naming_of(calibration.rotor).margin_nats
     misfit = _misfit(calibration, calibration.speed_rpm)
     nearest = sorted(_SPEEDS, key=lambda part: abs(part - 1.0))
     opens = (part for part in nearest if _misfit(calibration, part * calibration.speed_rpm) >= margin)

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.transient import Comparison
 
@@ -399,6 +400,11 @@ class NamingRules:
 NAMED_BY_RUN_UP = NamingRules(margin_nats=3.5, rub_margin_nats=3.5)
 """Where a run-up has shown the rotor's two modes, odds of 3 to 1 are enough. Of finite-element rotors no more
 than 1 % of the faults get a wrong name then, as with 5 nats, and fewer stay in a group."""
+
+
+def naming_of(rotor: LavalRotor) -> NamingRules:
+    """The margins of a name, by what is known of the rotor."""
+    return NamingRules() if rotor.two_modes is None else NAMED_BY_RUN_UP
 
 
 @dataclass(frozen=True, slots=True)

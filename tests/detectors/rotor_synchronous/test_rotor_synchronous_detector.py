@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from daqsvc.diagnosis.detector import Window
 from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.model import RotorParameters, TwoModes
 from daqsvc.rotor.synchronous.watch import WatchRules
 from sim_hw.plants import rotor as plant
 
@@ -206,6 +208,23 @@ def test_a_calibration_of_an_earlier_time_begins_at_once(steady, grown):
     said = run(detector(calibration=first.watch.calibration), grown[30 * PER_REV :])
     assert course(said) == ["normal", "departure", "unbalance"]
     assert said[-1].statistics["calibration.revolutions"] == 50.0
+
+
+@pytest.mark.parametrize("from_file", [False, True])
+def test_a_run_up_gives_a_name_with_less_of_a_lead(steady, from_file):
+    """The margin is stated, as it is the threshold of the name."""
+    modes = TwoModes(support_share=0.5, support_lag=0.4)
+    known = RotorParameters(
+        natural_frequency_hz=31.0, damping_ratio=0.1, eccentricity_um=0.0, clearance_um=1.0, two_modes=modes
+    )
+    calibrated = detector()
+    run(calibrated, steady)
+    found = []
+    for rotor in (ROTOR, replace(ROTOR, two_modes=known)):
+        calibration = replace(calibrated.watch.calibration, rotor=rotor) if from_file else None
+        said = run(detector(rotor=ROTOR if from_file else rotor, calibration=calibration), steady)
+        found.append(said[-1].thresholds["identity"])
+    assert found == [5.0, 3.5]
 
 
 def test_the_last_look_at_a_short_recording(grown):
