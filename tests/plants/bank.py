@@ -222,10 +222,13 @@ def _moved(z: NDArray[np.complex128], angle: NDArray[np.float64]) -> float:
 def _told_delay(
     detector: RotorBankDetector, z: NDArray[np.complex128], angle: NDArray[np.float64], fault: str
 ) -> float | None:
-    """Revolutions until the evidence of any level of the fault, summed from the change on, is enough."""
-    if fault == "healthy":
-        return None
+    """Revolutions until the evidence of any level of the fault, summed from the change on, is enough.
+
+    None if it never is, or if the bank has no level of it: the machine would whirl by itself.
+    """
     modes = [m for m in detector.bank_modes if m.name.rsplit(" ", 1)[0] in {"healthy", fault}]
+    if len(modes) < 2:
+        return None
     figures = {
         "noise": detector.noise,
         "duration": detector.duration,
