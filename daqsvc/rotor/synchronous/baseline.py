@@ -244,7 +244,11 @@ def calibrate(
     moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz)
     samples = float(vectors.samples.mean())
     law = learn(
-        moved, deviation, np.full(5, float(vectors.noise.mean()) / samples), *rotor.speed_slope(speed_rad_s)
+        moved,
+        deviation,
+        np.full(5, float(vectors.noise.mean()) / samples),
+        *rotor.speed_slope(speed_rad_s),
+        settling_rev=-1.0 / math.log(_memory(rotor, speed_rad_s)),
     )
     if law is not None:
         moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz, law)

@@ -6,6 +6,9 @@ and damping are known roughly, or because the machine is no Laval rotor, is a li
 
     Z_k(Omega) = b_k + s_k (Omega / Omega_0 - 1)
 
+The rotor is late, by the revolutions that its free motion dies away in: while the speed rises, 1X is not what
+it is at that speed while it falls. A calibration often sees one of the two only, and its line is off by that.
+
 The slopes have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move teaches
 nothing, and the prior stays.
 """
@@ -29,6 +32,11 @@ _LEAST_HUNTING = 1e-3
 """Standard deviation of the relative speed below which nothing is learnt."""
 _MOST_JITTER = 0.5
 """Part of its square that may change from one revolution to the next: a shaft hunts slowly, marks jitter."""
+_SMOOTHED_REV = 9
+"""Revolutions that the rate of the speed is taken over."""
+_LATE = 2.0
+"""Revolutions by which a rotor is late, over those that its free motion dies away in: one of the two modes of
+uneven supports is later than the other."""
 _MODEL_DOUBT = 2.0
 """Standard deviation of a slope that no figures of a rotor give, in parts of the one that they give."""
 
@@ -49,7 +57,12 @@ class SpeedLaw:
 
 
 def learn(
-    moved: Complexes, deviation: Floats, variance: Floats, slope: complex, slope_spread: float
+    moved: Complexes,
+    deviation: Floats,
+    variance: Floats,
+    slope: complex,
+    slope_spread: float,
+    settling_rev: float,
 ) -> SpeedLaw | None:
     """Fit the line; None where the speed does not hunt, or only the marks of the keyphasor jitter.
 
@@ -59,6 +72,7 @@ def learn(
         variance: float64 ``[5]``, variance of one revolution's vector, um^2.
         slope: d ln Z_1 / d ln Omega of the stated rotor.
         slope_spread: standard deviation of it over the rotor's tolerances.
+        settling_rev: revolutions in which the free motion of the stated rotor dies away, to 1/e.
     """
     away = deviation - deviation.mean()
     hunting, jitter = float((away**2).mean()), float((np.diff(deviation) ** 2).mean()) / 2.0
@@ -77,4 +91,12 @@ def learn(
     furthest = float(np.abs(away).max())
     # The next term of the series of a resonance is as much smaller as this one is than the whole.
     bend = (steep * furthest) ** 2 / max(whirl, 1e-12)
-    return SpeedLaw(slopes, spread, bend)
+    late = steep * _fastest(away) * _LATE * settling_rev
+    return SpeedLaw(slopes, spread, np.hypot(bend, late))
+
+
+def _fastest(deviation: Floats) -> float:
+    """Largest change of the relative speed in a revolution, without the jitter of the marks."""
+    width = min(_SMOOTHED_REV, len(deviation) // 2)
+    smooth = np.convolve(deviation, np.full(width, 1.0 / width), mode="valid")
+    return float(np.abs(np.diff(smooth)).max())
