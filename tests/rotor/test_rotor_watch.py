@@ -168,6 +168,26 @@ def test_a_hunting_speed_teaches_what_the_stated_rotor_does_not_know():
     assert next(report.revolution for report in reports if report.departed) in range(201, 204)
 
 
+def test_a_rotor_that_follows_its_speed_late_is_no_fault():
+    """The calibration sees the speed fall only; while it rises, 1X at the same speed is another."""
+    phase = 2.0 * math.pi * np.arange(700) / 120.0
+    # Of two modes, the one that dies away more slowly counts: here by 1.7 times.
+    late_rev = 1.7 / (2.0 * math.pi * 0.03)
+    deviation, late = 0.011 * np.cos(phase), 0.011 * np.cos(phase - 2.0 * math.pi * late_rev / 120.0)
+    moved = np.tile(with_change(backward=6.0), (700, 1))
+    moved[:, 1] *= unbalance_response(1.0 + late, 0.03) / unbalance_response(1.0, 0.03)
+    moved[:, 2] += 300.0 * late
+    watch = RotorWatch(replace(ROTOR, damping_ratio=0.03), RATE_HZ)
+    reports = watch.evaluate(synchronous_vectors(orbits(moved, 1.0, 5, deviation=deviation)))
+    assert watch.calibration.law is not None
+    assert not any(report.departed for report in reports)
+    # Nor is it a licence: an unbalance that grows by half is still seen.
+    moved[300:, 1] *= 1.5
+    watch = RotorWatch(replace(ROTOR, damping_ratio=0.03), RATE_HZ)
+    reports = watch.evaluate(synchronous_vectors(orbits(moved, 1.0, 5, deviation=deviation)))
+    assert next(report.revolution for report in reports if report.departed) in range(301, 331)
+
+
 def test_drift_of_the_probes_is_no_static_load():
     drifting = with_change(dc=3.0j)
     _, reports = life((100, HEALTHY), (100, drifting), rules=WatchRules(probe_drift_um=4.0))
