@@ -53,6 +53,7 @@ laws = st.builds(
     slopes_um=st.lists(complexes, min_size=5, max_size=5).map(lambda s: np.array(s, np.complex128)),
     spread_um=sizes,
     bend_um=sizes,
+    late_um=sizes,
 )
 
 
@@ -198,6 +199,16 @@ def test_a_saved_calibration_can_be_loaded(tmp_path: Path) -> None:
     with pytest.raises(CalibrationFileError, match=r"no baseline within 5 % of 4400.0 rpm, but at 5110.0"):
         load_calibration(path, 4400.0)
     assert len(load_record(path).steady) == 2
+
+
+def test_a_file_of_an_earlier_version_knows_nothing_of_a_late_rotor() -> None:
+    law = SpeedLaw(np.ones(5, np.complex128), *(np.full(5, size) for size in (0.1, 0.2, 0.3)))
+    kept = replace(record(5110.0), steady=(replace(calibration(), law=law),))
+    text = record_text(kept)
+    assert parse_record(text, HERE).steady[0].law.late_um.tolist() == [0.3] * 5
+    earlier = parse_record(text.replace(", late_um = [0.3, 0.3, 0.3, 0.3, 0.3]", ""), HERE).steady[0].law
+    assert earlier.late_um.tolist() == [0.0] * 5
+    assert earlier.bend_um.tolist() == [0.2] * 5
 
 
 RUN_UP = RunUpFit(

@@ -333,12 +333,15 @@ class _SpeedLawTable(_CalibrationTable):
     slope_im_um: _Five
     slope_uncertainty_um: _FiveSizes
     bend_um: _FiveSizes
+    late_um: _FiveSizes = [0.0] * 5
+    """Not in files of earlier versions."""
 
     def made(self) -> SpeedLaw:
         return SpeedLaw(
             slopes_um=np.array(self.slope_re_um) + 1j * np.array(self.slope_im_um),
             spread_um=np.array(self.slope_uncertainty_um),
             bend_um=np.array(self.bend_um),
+            late_um=np.array(self.late_um),
         )
 
 
@@ -585,6 +588,7 @@ def _steady_lines(calibration: Calibration, verdict: str, source: str) -> Iterat
             "slope_im_um": law.slopes_um.imag,
             "slope_uncertainty_um": law.spread_um,
             "bend_um": law.bend_um,
+            "late_um": law.late_um,
         }
         yield "# how the components below follow the speed, um for a relative change of 1; the speed hunted"
         yield f"speed_law = {{ {', '.join(f'{key} = {row.tolist()!r}' for key, row in figures.items())} }}"

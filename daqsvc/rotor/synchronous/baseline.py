@@ -352,7 +352,7 @@ def _refuse_unsteady(
     _, slope = rotor.speed_slope(speed_rad_s)
     guard = amplitude * slope * deviation
     if law is not None:
-        guard, floor = float(law.spread_um.max()) * deviation, floor + float(law.bend_um.max()) ** 2
+        guard, floor = float(law.spread_um.max()) * deviation, floor + float(law.off_um.max()) ** 2
     jitter_rad = 0.0 if assumed else _EDGE_SAMPLES * 2.0 * math.pi / samples
     odd = oddest_stretch(moved, white, memory, floor, guard, jitter_rad)
     if odd.nats <= VECTOR_NATS:

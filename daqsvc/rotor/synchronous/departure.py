@@ -109,7 +109,7 @@ class Spread:
         slope = 0.0 if self.law is not None else self.speed_slope
         if self.law is not None:
             variance = variance + (self.law.spread_um * np.asarray(speed)[..., np.newaxis]) ** 2
-            variance = variance + self.law.bend_um**2
+            variance = variance + self.law.off_um**2
         guard = (self.amplitude_um * slope * np.asarray(speed)) ** 2
         guard = guard + (self.amplitude_um * self.turn_rad * np.asarray(apart)) ** 2
         variance[..., 1] += guard

@@ -15,7 +15,7 @@ nothing, and the prior stays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,11 +49,23 @@ class SpeedLaw:
         slopes_um: complex128 ``[5]``, s_k: um for a relative change of speed of 1.
         spread_um: float64 ``[5]``, standard deviation of each.
         bend_um: float64 ``[5]``, what the line is off by at most within the speeds that it was learnt from.
+        late_um: float64 ``[5]``, what it is off by at most while the speed changes, as the rotor is late;
+            this cancels over whole swings of the speed.
     """
 
     slopes_um: Complexes
     spread_um: Floats
     bend_um: Floats
+    late_um: Floats
+
+    @property
+    def off_um(self) -> Floats:
+        """What the line is off by at most, float64 ``[5]``."""
+        return np.hypot(self.bend_um, self.late_um)
+
+    def over_swings(self) -> SpeedLaw:
+        """The same of means over whole swings of the speed."""
+        return replace(self, late_um=np.zeros_like(self.late_um))
 
 
 def learn(
@@ -92,7 +104,7 @@ def learn(
     # The next term of the series of a resonance is as much smaller as this one is than the whole.
     bend = (steep * furthest) ** 2 / max(whirl, 1e-12)
     late = steep * _fastest(away) * _LATE * settling_rev
-    return SpeedLaw(slopes, spread, np.hypot(bend, late))
+    return SpeedLaw(slopes, spread, bend, late)
 
 
 def _fastest(deviation: Floats) -> float:

@@ -440,7 +440,8 @@ class RotorWatch:
         shift = self._healthy.baseline - self.calibration.baseline
         change = vectors.mean(axis=0) - shift
         spread = self._spread(self._healthy)
-        spread = replace(spread, variance=np.maximum(spread.variance, scatter(rows)))
+        law = None if spread.law is None else spread.law.over_swings()
+        spread = replace(spread, variance=np.maximum(spread.variance, scatter(rows)), law=law)
         apart = float(np.mean([row.revolution for row in rows])) - self._middle
         variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed, apart)
         # Only the two modes of a run-up show how a force passes through the rotor at three times its speed.
