@@ -190,6 +190,15 @@ def test_a_rotor_that_follows_its_speed_late_is_no_fault():
     assert watch.finish().evidence["unbalance"] > 20.0
 
 
+def test_a_stiff_rotor_that_turns_slowly_is_not_late():
+    """Its free motion dies away within a thousandth of a revolution."""
+    stiff = replace(ROTOR, natural_frequency_hz=1000.0 * ROTOR.natural_frequency_hz)
+    deviation = 0.01 * np.sin(2.0 * math.pi * np.arange(100) / 60.0)
+    cut = orbits(np.tile(HEALTHY, (100, 1)), NOISE_UM, 5, deviation=deviation)
+    law = calibrate(synchronous_vectors(cut), stiff, RATE_HZ).law
+    assert law.late_um.max() < 1e-3 * NOISE_UM
+
+
 def test_drift_of_the_probes_is_no_static_load():
     drifting = with_change(dc=3.0j)
     _, reports = life((100, HEALTHY), (100, drifting), rules=WatchRules(probe_drift_um=4.0))

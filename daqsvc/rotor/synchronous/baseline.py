@@ -248,7 +248,7 @@ def calibrate(
         deviation,
         np.full(5, float(vectors.noise.mean()) / samples),
         *rotor.speed_slope(speed_rad_s),
-        settling_rev=-1.0 / math.log(_memory(rotor, speed_rad_s)),
+        settling_rev=1.0 / (2.0 * math.pi * _decay(rotor, speed_rad_s)),
     )
     if law is not None:
         moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz, law)
@@ -285,8 +285,12 @@ def with_more(calibration: Calibration, baseline: Complexes, revolutions: int) -
 
 def _memory(rotor: LavalRotor, speed_rad_s: float) -> float:
     """Correlation of a stirred orbit from one revolution to the next."""
-    decay = rotor.damping_ratio * rotor.natural_frequency_rad_s / abs(speed_rad_s)
-    return math.exp(-2.0 * math.pi * decay)
+    return math.exp(-2.0 * math.pi * _decay(rotor, speed_rad_s))
+
+
+def _decay(rotor: LavalRotor, speed_rad_s: float) -> float:
+    """By what power of e the free motion dies away, while the shaft turns by 1."""
+    return rotor.damping_ratio * rotor.natural_frequency_rad_s / abs(speed_rad_s)
 
 
 def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Floats:
