@@ -95,7 +95,7 @@ class RotorSynchronousDetector:
         reference: what gives the shaft angle. ``"fixed"``: the stated speed is exact, the first sample is
             angle zero. ``"orbit"``: the angle follows the orbit's 1X; a slow turn of its phase is not seen.
         rotor: what is known about the rotor.
-        rules: thresholds.
+        rules: thresholds. The margins of a name follow from what is known of the rotor (`naming_of`).
         calibration: of an earlier time; made of the first revolutions if not given.
         ac_coupled: whether the probes show no static position.
         name: name of the detector.
