@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from daqsvc.rotor.discretise import BankMode
 
+    Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
 VARIANCE_FACTOR = 1.5
@@ -28,6 +29,8 @@ VARIANCE_FACTOR = 1.5
 allows for errors of natural frequency and damping of a few per cent."""
 MODEL_ERROR = 0.1
 """Part of the healthy orbit that a rotor with two modes may be off by after a fault."""
+_LEAST_SAMPLES_OF_3X = 16
+"""Samples in a revolution with which 3X is well separated from the other components."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +42,33 @@ class SteadyMotion:
         backward: radius of the part that turns against it; 0 on the paper's rotor.
         rest: centre.
         samples: number of samples that it was fitted to.
+        harmonics: 2X and 3X of what it leaves over, each forward and backward; None if not looked for, or
+            if a revolution has too few samples for it.
     """
 
     forward: complex
     backward: complex
     rest: complex
     samples: int
+    harmonics: tuple[complex, complex, complex, complex] | None = None
+
+    def with_harmonics(self, xy: Floats, cos: Floats, sin: Floats) -> SteadyMotion:
+        """The same motion with its harmonics, from the samples of about a revolution that it was fitted to.
+
+        Args:
+            xy: float64 ``[n, 2]``, position.
+            cos: float64 ``[n]``, cosine of the shaft angle.
+            sin: float64 ``[n]``, its sine.
+        """
+        if self.samples < _LEAST_SAMPLES_OF_3X:
+            return self
+        turn, z = _there(xy, cos, sin)
+        left = z - (self.forward * turn + self.backward * turn.conj() + self.rest)
+        twice = turn * turn
+        thrice = twice * turn
+        sums = (np.vdot(twice, left), np.dot(twice, left), np.vdot(thrice, left), np.dot(thrice, left))
+        a, b, c, d = (complex(one) / self.samples for one in sums)
+        return replace(self, harmonics=(a, b, c, d))
 
 
 class SteadyFit:
@@ -64,12 +88,7 @@ class SteadyFit:
             cos: float64 ``[n]``, cosine of the shaft angle.
             sin: float64 ``[n]``, its sine.
         """
-        turn = np.empty(len(cos), np.complex128)
-        turn.real, turn.imag = cos, sin
-        z = np.ascontiguousarray(xy).view(np.complex128)[:, 0]
-        known = np.isfinite(turn) & np.isfinite(z)
-        if not known.all():
-            turn, z = turn[known], z[known]
+        turn, z = _there(xy, cos, sin)
         self._turn += complex(turn.sum())
         self._twice += complex(np.dot(turn, turn))
         self._moment += (np.vdot(turn, z), np.dot(turn, z), z.sum())
@@ -95,6 +114,15 @@ class SteadyFit:
             raise ValueError(f"{self.samples} samples do not cover a revolution; take more of them")
         forward, backward, rest = np.linalg.solve(normal, self._moment).tolist()
         return SteadyMotion(forward, backward, rest, self.samples)
+
+
+def _there(xy: Floats, cos: Floats, sin: Floats) -> tuple[Complexes, Complexes]:
+    """Shaft angle as exp(i theta) and position z of the samples that are finite."""
+    turn = np.empty(len(cos), np.complex128)
+    turn.real, turn.imag = cos, sin
+    z = np.ascontiguousarray(xy).view(np.complex128)[:, 0]
+    known = np.isfinite(turn) & np.isfinite(z)
+    return (turn, z) if known.all() else (turn[known], z[known])
 
 
 def adapted(modes: Sequence[BankMode], motion: SteadyMotion, speed: float) -> tuple[BankMode, ...]:

@@ -38,8 +38,8 @@ LEAST_MODEL_ERROR = 0.02
 """Part of a change by which the best model is taken to be off, however well it fits."""
 LEAST_REVOLUTIONS = 8
 """Revolutions that a motion has to be steady for."""
-_PARTS = 3
-"""Of a motion, each of which the model may miss."""
+_PARTS, _COMPONENTS = 3, 7
+"""Of a motion: those that the model may miss, and all with 2X and 3X."""
 _EXPLAINS = 0.4
 """Part of a change that a fault may miss and still be taken for its cause."""
 _FROM_A_LEVEL = frozenset({"normal", "rub"})
@@ -62,7 +62,7 @@ _UNSTEADY = 0.1
 
 
 class SteadyMotions:
-    """Where the machine ends in each mode: forward and backward 1X and mean position, in clearances.
+    """Where the machine ends in each mode: both senses of 1X, mean position and harmonics, in clearances.
 
     Args:
         duration: normalised time between samples.
@@ -70,7 +70,7 @@ class SteadyMotions:
 
     def __init__(self, duration: float) -> None:
         self._duration = duration
-        self._rubs: Complexes = np.empty((0, 3), dtype=np.complex128)
+        self._rubs: Complexes = np.empty((0, _COMPONENTS), dtype=np.complex128)
         self._speed = math.nan
 
     def of(self, observers: Observers, couplings: Couplings) -> Complexes:
@@ -84,20 +84,16 @@ class SteadyMotions:
             couplings: ``[M]`` of `coupled.COUPLED`.
 
         Returns:
-            complex128 ``[M, 3]``.
+            complex128 ``[M, 7]``: 1X forward and backward, mean position, and 2X and 3X as 1X.
         """
         rubs, speed = np.flatnonzero(observers["substeps"]), float(observers["speed"][0])
         if not abs(self._speed / speed - 1.0) < _SAME_SPEED:
             simulated = [_of_rub(observers[i], couplings[i], self._duration) for i in rubs]
-            self._rubs, self._speed = np.array(simulated).reshape(-1, 3), speed
-        motions = np.stack(
-            [
-                observers["a"] + 1j * observers["b"],
-                couplings["back_a"] + 1j * couplings["back_b"],
-                observers["rest_x"] + 1j * observers["rest_y"],
-            ],
-            axis=1,
-        )
+            self._rubs, self._speed = np.array(simulated).reshape(-1, _COMPONENTS), speed
+        motions = np.zeros((len(observers), _COMPONENTS), dtype=np.complex128)
+        motions[:, 0] = observers["a"] + 1j * observers["b"]
+        motions[:, 1] = couplings["back_a"] + 1j * couplings["back_b"]
+        motions[:, 2] = observers["rest_x"] + 1j * observers["rest_y"]
         motions[rubs] = self._rubs
         return motions
 
@@ -110,7 +106,8 @@ def hunting(healthy: NormalisedRotor, speed: float) -> Complexes:
         speed: normalised speed.
 
     Returns:
-        complex128 ``[P, 3]``, as of `SteadyMotions.of`; at the speed itself in the middle.
+        complex128 ``[P, 3]``, the first three components of `SteadyMotions.of`; at the speed itself in the
+        middle.
     """
     return np.array([_motion(healthy, w) for w in (speed * _HUNTING).tolist()])
 
@@ -146,13 +143,18 @@ def _of_rub(observer: np.void, coupling: np.void, duration: float) -> Complexes:
         fit.add(xy[part], cos[part], sin[part])
         whole = fit.samples == part.stop - part.start
         if not whole or np.hypot(*xy[part].T).max() < 1.0:
-            return np.full(3, np.nan, dtype=np.complex128)
-        motion = fit.solve()
-        halves.append(np.array([motion.forward, motion.backward, motion.rest]))
+            return np.full(_COMPONENTS, np.nan, dtype=np.complex128)
+        halves.append(_components(fit.solve().with_harmonics(xy[part], cos[part], sin[part])))
     before, after = halves
-    if not np.linalg.norm(after - before) <= _UNSTEADY * np.linalg.norm(after):
-        return np.full(3, np.nan, dtype=np.complex128)
+    if not np.linalg.norm((after - before)[:_PARTS]) <= _UNSTEADY * np.linalg.norm(after[:_PARTS]):
+        return np.full(_COMPONENTS, np.nan, dtype=np.complex128)
     return np.asarray((before + after) / 2.0)
+
+
+def _components(motion: SteadyMotion) -> Complexes:
+    """Complex128 ``[7]``, as of `SteadyMotions.of`; NaN are the harmonics that are not known."""
+    harmonics = motion.harmonics or (math.nan,) * (_COMPONENTS - _PARTS)
+    return np.array([motion.forward, motion.backward, motion.rest, *harmonics])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -170,12 +172,15 @@ class SteadyChange:
     """How far the motion of some revolutions is from healthy.
 
     Attributes:
-        moved: complex128 ``[3]``, forward and backward 1X and mean position, in clearances.
+        moved: complex128 ``[3]``, forward and backward 1X and mean position, in clearances; or ``[7]``, with
+            the harmonics of `SteadyMotions.of`.
         samples: that it is the mean of.
+        variance: float64, of each component of the mean by its scatter, squared clearances; None: not known.
     """
 
     moved: Complexes
     samples: int
+    variance: Floats | None = None
 
     def is_certain(self, nearby: Complexes, noise: float) -> bool:
         """Whether no healthy machine moves so, though the observers may see it as well as the healthy one.
@@ -205,22 +210,48 @@ def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes, noise: fl
 
     Args:
         motions: of whole revolutions, the oldest first.
-        healthy: complex128 ``[3]``, the healthy mode's.
+        healthy: complex128 ``[3]`` or, with harmonics, ``[7]``, the healthy mode's.
         noise: standard deviation of the measured position, in clearances.
     """
     count = len(motions)
+    if count < LEAST_REVOLUTIONS:
+        return None
+    whole = np.array([_components(one)[: len(healthy)] for one in motions]) - healthy
+    sizes = np.array([one.samples for one in motions])
     while count >= LEAST_REVOLUTIONS:
-        latest = motions[-count:]
-        parts = np.array([[one.forward, one.backward, one.rest] for one in latest]) - healthy
+        parts, samples = whole[-count:], int(sizes[-count:].sum())
         moved = parts.mean(axis=0)
-        drift = parts[count // 2 :].mean(axis=0) - parts[: count // 2].mean(axis=0)
-        samples = sum(one.samples for one in latest)
+        drift = (parts[count // 2 :].mean(axis=0) - parts[: count // 2].mean(axis=0))[:_PARTS]
         # The mean of half the samples has a variance of 4 noise^2 / samples in each of its parts.
         by_noise = _SIGNIFICANT * noise * math.sqrt(8.0 * _PARTS / samples)
-        if np.linalg.norm(drift) <= max(_UNSTEADY * float(np.linalg.norm(moved)), by_noise):
-            return SteadyChange(moved, samples)
+        if np.linalg.norm(drift) <= max(_UNSTEADY * float(np.linalg.norm(moved[:_PARTS])), by_noise):
+            return SteadyChange(moved, samples, _of_mean(parts, samples, noise))
         count //= 2
     return None
+
+
+def steady_baseline(motions: Sequence[SteadyMotion], noise: float) -> tuple[Complexes, Floats] | None:
+    """Mean of a healthy machine's motions, and the variance of it.
+
+    Args:
+        motions: of whole revolutions.
+        noise: standard deviation of the measured position, in clearances.
+
+    Returns:
+        complex128 and float64 ``[7]``, in clearances and their square; None where harmonics are not known.
+    """
+    parts = np.array([_components(one) for one in motions]).reshape(-1, _COMPONENTS)
+    parts = parts[np.isfinite(parts).all(axis=1)]
+    if len(parts) < LEAST_REVOLUTIONS:
+        return None
+    samples = sum(one.samples for one in motions if one.harmonics is not None)
+    return parts.mean(axis=0), _of_mean(parts, samples, noise)
+
+
+def _of_mean(parts: Complexes, samples: int, noise: float) -> Floats:
+    """Variance of a mean of motions: by the noise, or by their scatter, if that is more."""
+    scatter = np.var(parts, axis=0) / (len(parts) - 1)
+    return np.asarray(np.maximum(2.0 * noise**2 / samples, scatter))
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +287,8 @@ def misfit(
 
     Args:
         change: the change.
-        motions: complex128 ``[M, 3]``, of `SteadyMotions`; the first is healthy.
+        motions: complex128 ``[M, 7]``, of `SteadyMotions`; the first is healthy. Harmonics have no part in
+            this: they show contact, and not how well the model knows the machine.
         faults: ``[M]``, what each mode is called: ``"normal"``, ``"rub"``, ...
         noise: standard deviation of the measured position, in clearances.
         nats: evidence behind the best fault from which a fault is excluded, and below which it is not told
@@ -265,14 +297,14 @@ def misfit(
             springs, a load moves no 1X. They have no part in its error.
     """
     levels: dict[str, list[Complexes]] = {}
-    for fault, motion in zip(faults, motions - motions[0], strict=True):
-        levels.setdefault(fault, [] if fault in _FROM_A_LEVEL else [np.zeros(3, complex)]).append(motion)
+    moved = change.moved[:_PARTS]
+    for fault, motion in zip(faults, (motions - motions[0])[:, :_PARTS], strict=True):
+        levels.setdefault(fault, [] if fault in _FROM_A_LEVEL else [np.zeros(_PARTS, complex)]).append(motion)
     off = {
-        fault: _distance(change.moved, points, beyond=fault not in _FROM_A_LEVEL)
-        for fault, points in levels.items()
+        fault: _distance(moved, points, beyond=fault not in _FROM_A_LEVEL) for fault, points in levels.items()
     }
     missed = np.array([off[fault] for fault in faults])
-    size = float(np.linalg.norm(change.moved))
+    size = float(np.linalg.norm(moved))
     by_noise, least = 2.0 * noise**2 / change.samples, (LEAST_MODEL_ERROR * size) ** 2
     wrong = np.isin(faults, list(exact)) & (missed**2 > 2.0 * nats * (least + by_noise))
     rest = np.where(wrong, np.nan, missed**2)

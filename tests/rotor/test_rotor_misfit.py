@@ -175,7 +175,8 @@ def motions_of(modes):
 def test_modes_without_contact_end_on_their_orbits():
     for mode, motion in zip(bank_modes()[:3], motions_of(bank_modes()), strict=False):
         rotor = mode.rotor
-        np.testing.assert_allclose(motion, [rotor.orbit(), rotor.backward_orbit(), rotor.rest])
+        np.testing.assert_allclose(motion[:3], [rotor.orbit(), rotor.backward_orbit(), rotor.rest])
+        assert not motion[3:].any()
 
 
 def test_a_rub_ends_where_its_equation_of_motion_does():
@@ -202,7 +203,7 @@ def test_a_rub_ends_where_its_equation_of_motion_does():
     expected = fit.solve()
     assert np.hypot(*path.y[:2, part]).max() > 1.0
     found = motions_of(bank_modes())[3]
-    np.testing.assert_allclose(found, [expected.forward, expected.backward, expected.rest], atol=0.01)
+    np.testing.assert_allclose(found[:3], [expected.forward, expected.backward, expected.rest], atol=0.01)
 
 
 def test_a_rub_is_simulated_again_where_the_speed_has_changed():
@@ -265,7 +266,8 @@ def test_the_healthy_machine_nearby_is_the_one_of_the_observers(w):
     observers = discretise(modes, noise=NOISE, duration=DURATION)
     couplings = couple(modes, observers, noise=NOISE, duration=DURATION)
     nearby = hunting(rotor, w)
-    assert nearby[len(nearby) // 2] == pytest.approx(SteadyMotions(DURATION).of(observers, couplings)[0])
+    healthy = SteadyMotions(DURATION).of(observers, couplings)[0]
+    assert nearby[len(nearby) // 2] == pytest.approx(healthy[:3])
 
 
 RESONANT = replace(ROTOR, w=1.0, zeta=0.04, anisotropy=0.0, cross_stiffness=0.001)

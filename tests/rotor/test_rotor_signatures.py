@@ -166,6 +166,27 @@ def test_an_orbit_that_fills_the_clearance_touches_whatever_its_shape():
     assert judged(change, wide)[0] == "unmodelled"
 
 
+def test_a_shaft_that_a_load_bends_to_the_wall_does_not_rub():
+    # Sag and whirl take 88 of 105 um; the load a part of the rest, or nearly all of it.
+    machine = healthy(rotor=replace(ROTOR, clearance_um=105.0))
+    machine = replace(machine, baseline=machine.baseline + only(0, -50.0j))
+    for load, variance in ((-10.0j, VARIANCE), (-14.0j, 0.01 * VARIANCE)):
+        assert abs(machine.baseline[0] + load) + abs(machine.baseline[1]) > 0.9 * 105.0
+        best, scores = judged(only(0, load), machine, variance)
+        assert best == "static_load"
+        assert scores["static_load"] - scores["rub"] > 5.0
+    # The same with harmonics.
+    touched = only(0, -14.0j) + only(2, 1.5) + only(-2, 1.0j)
+    assert judged(touched, machine, 0.01 * VARIANCE)[0] == "rub"
+
+
+def test_a_whirl_around_the_clearance_rubs_without_harmonics():
+    machine = healthy()
+    clearance_um = machine.rotor.clearance_um
+    around = only(1, clearance_um - machine.baseline[1]) + only(0, 0.02 * clearance_um)
+    assert judged(around, machine)[0] == "rub"
+
+
 def test_an_elliptic_orbit_grows_in_both_senses_with_the_unbalance():
     machine = healthy(laval=False, ellipticity=0.3)
     factor = 0.7 * np.exp(0.5j)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes, fault_of
+from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes, fault_of, is_one_fault
 from daqsvc.detectors.rotor_bank.orbit_checks import OrbitWatch
 from daqsvc.detectors.rotor_bank.statements import (
     DEPARTURE,
@@ -25,7 +25,16 @@ from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.misfit import SteadyChange, SteadyMotions, hunting, misfit, steady_change
+from daqsvc.rotor.misfit import (
+    Misfit,
+    SteadyChange,
+    SteadyMotions,
+    hunting,
+    misfit,
+    steady_baseline,
+    steady_change,
+)
+from daqsvc.rotor.steady_faults import SteadyFaults, narrowed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -37,6 +46,7 @@ if TYPE_CHECKING:
     from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.model import NormalisedRotor, RotorParameters
 
+    Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
 __all__ = ["DEPARTURE", "KeyphasorProbe", "Probe", "RotorBankDetector", "RotorMode"]
@@ -68,9 +78,12 @@ class RotorBankDetector:
     decision is then ``departure`` with the candidates as group, at once and until the cause is known.
     The declared mode has not changed by that.
 
-    A rotor with two modes is only nearly the machine. There the steady motion after a change is compared
-    with where each fault takes the machine (`daqsvc.rotor.misfit`). What is too far from it is left out; what
-    is not told apart by more than the model's own error is one group.
+    A rotor with two modes is only nearly the machine. There the steady motion after a change decides which
+    faults it may be. The signatures of the calibrated rotor judge it (`daqsvc.rotor.steady_faults`). They do
+    not where no healthy motion was measured at this speed, a mode has several faults in one, the probes are
+    AC-coupled, or a revolution has fewer than 16 samples. Then, and where no fault explains the change, it is
+    compared with where each mode takes the machine (`daqsvc.rotor.misfit`). What is too far from it is left
+    out; what is not told apart by more than the model's own error is one group.
 
     A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
     guess, the observers start again. While the quality is not good there is no evidence, and the decision is
@@ -193,6 +206,10 @@ class RotorBankDetector:
         self._departed = False
         self._calibrated_speed = math.nan
         self._steady_motions = SteadyMotions(self._duration)
+        judged = not ac_coupled and all(is_one_fault(mode, rotor) for mode in self._modes[1:])
+        self._two_mode_rotor = rotor if judged and rotor.two_modes is not None else None
+        self._steady_faults: SteadyFaults | None = None
+        self._harmonics: Complexes = np.zeros(4, dtype=np.complex128)
         self._misfit = math.nan
         self._last_revolution = np.empty((0, 3))
         self._next_index: int | None = None
@@ -385,12 +402,14 @@ class RotorBankDetector:
         if not len(bank.couplings) or self._rules.rule != "cusum" or bank.decision == UNDETERMINED:
             return
         nearby = hunting(self._bank_modes[0].rotor, bank.speed)
-        healthy = nearby[len(nearby) // 2]
+        healthy = np.concatenate((nearby[len(nearby) // 2], self._harmonics))
         change = steady_change(self._watch.motions, healthy, self._noise)
         certain = change is not None and self._at_calibrated_speed and change.is_certain(nearby, self._noise)
         if bank.decision == 0 and report.departure is None and not certain:
             self._misfit = math.nan
             bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
+            if self._steady_faults is not None:
+                self._steady_faults.forget()
             return
         if change is None:
             return
@@ -400,17 +419,24 @@ class RotorBankDetector:
             healthy_like[0] = False
             bank.exclude(healthy_like, np.zeros((count, count), dtype=np.bool_))
             return
-        off = misfit(
+        off = self._compared(change, self._steady_motions.of(bank.observers, bank.couplings))
+        if self._steady_faults is not None and self._at_calibrated_speed:
+            self._steady_faults.look(change)
+            off = self._steady_faults.narrowed(off)
+        off.excluded[0] |= certain
+        bank.exclude(off.excluded, off.pairs)
+        self._misfit = float(off.part[bank.decision])
+
+    def _compared(self, change: SteadyChange, motions: Complexes) -> Misfit:
+        """A steady change beside where each mode takes the machine."""
+        return misfit(
             change,
-            self._steady_motions.of(bank.observers, bank.couplings),
+            motions,
             list(self._faults.values()),
             noise=self._noise,
             nats=self._rules.group_nats,
             exact=self._exact,
         )
-        off.excluded[0] |= certain
-        bank.exclude(off.excluded, off.pairs)
-        self._misfit = float(off.part[bank.decision])
 
     def predicted_groups(self) -> dict[str, tuple[str, ...]]:
         """What would be stated of a machine that did exactly what a mode does, by the name of the mode.
@@ -427,19 +453,17 @@ class RotorBankDetector:
         nearby = hunting(self._bank_modes[0].rotor, bank.speed)
         faults = np.array(list(self._faults.values()))
         samples = round(_PREDICTED_REVOLUTIONS * self._nominal_period)
+        variance = np.full(motions.shape[1], 2.0 * self._noise**2 / samples)
+        steady_faults = self._steady_faults or self._judge_steady(motions[0], variance)
         predicted = {}
         for k in range(1, len(faults)):
-            change = SteadyChange(motions[k] - motions[0], samples)
+            change = SteadyChange(motions[k] - motions[0], samples, variance)
             if not np.isfinite(change.moved).all():
                 continue
-            off = misfit(
-                change,
-                motions,
-                list(faults),
-                noise=self._noise,
-                nats=self._rules.group_nats,
-                exact=self._exact,
-            )
+            off = self._compared(change, motions)
+            likely = None if steady_faults is None else steady_faults.likely(change)
+            if likely is not None:
+                off = narrowed(off, faults, likely)
             # No steady motion is compared of a machine that all observers take for the healthy one.
             off.excluded[0] = change.is_certain(nearby, self._noise)
             together = off.pairs[k] | (bank.look_alike(k) & ~off.excluded)
@@ -464,11 +488,29 @@ class RotorBankDetector:
         self._bank_modes, self._calibrated_speed = adapted(self._bank_modes, motion, speed), speed
         self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
         self._steady_motions = SteadyMotions(self._duration)
+        measured = steady_baseline(self._watch.motions[-self._calibrate_revolutions :], self._noise)
+        if measured is not None:
+            baseline, variance = measured
+            self._steady_faults, self._harmonics = self._judge_steady(baseline, variance), baseline[3:]
         self._calibration = None
         self._decision = self._modes[0].name
         report = self._bank.process(np.empty((0, 2)), np.empty(0), np.empty(0))
         onset = end_index - motion.samples
         return [self._diagnosis(report, verdict, onset, end_index, t_ns, 0, changed=True)]
+
+    def _judge_steady(self, baseline: Complexes, variance: Floats) -> SteadyFaults | None:
+        """A judge of steady changes from a healthy motion, in clearances; None where it is not of use."""
+        bank, rotor = self._bank, self._two_mode_rotor
+        if rotor is None or not len(bank.couplings):
+            return None
+        return SteadyFaults(
+            rotor,
+            list(self._faults.values()),
+            self._steady_motions.of(bank.observers, bank.couplings),
+            baseline=baseline,
+            variance=variance,
+            speed_rad_s=bank.speed * rotor.natural_frequency_rad_s,
+        )
 
     def _follow_speed(self, angle_rad: float) -> None:
         if math.isnan(angle_rad):

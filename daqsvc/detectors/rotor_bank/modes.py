@@ -76,6 +76,26 @@ def fault_of(mode: RotorMode, rotor: RotorParameters) -> Fault | Literal["normal
     return mode.fault or next(named, None) or "normal"
 
 
+def is_one_fault(mode: RotorMode, rotor: RotorParameters) -> bool:
+    """Whether a mode is one fault and nothing else; a rub may have any cause.
+
+    Args:
+        mode: a faulty mode.
+        rotor: the healthy rotor.
+    """
+    if mode.rub:
+        return True
+    damped = rotor.damping_ratio if mode.damping_ratio is None else mode.damping_ratio
+    differs: dict[Fault, bool] = {
+        "unbalance": mode.unbalance_ratio != 1.0,
+        "damping_loss": damped < rotor.damping_ratio,
+        "static_load": any(mode.static_load_um),
+        "stiffness_loss": mode.stiffness_ratio < 1.0,
+    }
+    grown = damped > rotor.damping_ratio or mode.stiffness_ratio > 1.0
+    return not grown and [name for name, does in differs.items() if does] == [fault_of(mode, rotor)]
+
+
 def usual_process_noise(healthy: NormalisedRotor) -> float:
     """Power spectral density q of observers for which none is given, normalised.
 

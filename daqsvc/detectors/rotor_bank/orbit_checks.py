@@ -30,6 +30,7 @@ _DIRECTION_REVOLUTIONS = 4
 _DC_REVOLUTIONS = 4
 _NO_DC = 0.25
 """Part of the expected static position below which the probes show none."""
+_KEPT_REVOLUTIONS = 128
 _SLIP_REVOLUTIONS = 32
 _SLIP_PARTS = 4
 _SLIP = 0.003
@@ -71,7 +72,7 @@ class OrbitWatch:
         self._blocks: list[tuple[Floats, Floats, Floats]] = []
         self._covered = 0
         self._forward = False
-        self._motions: deque[SteadyMotion] = deque(maxlen=_SLIP_REVOLUTIONS)
+        self._motions: deque[SteadyMotion] = deque(maxlen=_KEPT_REVOLUTIONS)
         self._doubt = ""
         self._unclear = ""
 
@@ -89,9 +90,10 @@ class OrbitWatch:
         if self._covered < revolution:
             return
         fit = SteadyFit()
-        fit.add(*map(np.concatenate, zip(*self._blocks, strict=True)))
+        xy, cos, sin = map(np.concatenate, zip(*self._blocks, strict=True))
+        fit.add(xy, cos, sin)
         if fit.samples > revolution // 2:
-            self._motions.append(fit.solve())
+            self._motions.append(fit.solve().with_harmonics(xy, cos, sin))
             self._look()
         self._blocks, self._covered = [], 0
 
@@ -106,7 +108,7 @@ class OrbitWatch:
 
     @property
     def motions(self) -> list[SteadyMotion]:
-        """Of the last revolutions, 32 at most, the oldest first."""
+        """Of the last revolutions, 128 at most, the oldest first; with harmonics."""
         return list(self._motions)
 
     def doubt(self) -> str:
@@ -115,7 +117,7 @@ class OrbitWatch:
 
     def _look(self) -> None:
         """Look at the orbit with one more revolution."""
-        motions = list(self._motions)
+        motions = list(self._motions)[-_SLIP_REVOLUTIONS:]
         if not self._forward:
             forward = _radius([motion.forward for motion in motions])
             backward = _radius([motion.backward for motion in motions])
@@ -149,7 +151,7 @@ class OrbitWatch:
         )
 
     def _static_position(self) -> str:
-        motions = list(self._motions)
+        motions = list(self._motions)[-_SLIP_REVOLUTIONS:]
         if self._static_seen or len(motions) < _DC_REVOLUTIONS:
             return ""
         expected = abs(self._expected_rest)
@@ -166,7 +168,7 @@ class OrbitWatch:
         )
 
     def _slip(self) -> str:
-        motions = list(self._motions)
+        motions = list(self._motions)[-_SLIP_REVOLUTIONS:]
         if len(motions) < _SLIP_REVOLUTIONS:
             return ""
         forward = np.array([motion.forward for motion in motions])

@@ -27,9 +27,17 @@ _LINEAR_2X = 0.003
 """Part of a change that a linear rotor leaves at 2X, by runout that is resampled."""
 _FILLED = 0.9
 """Part of the clearance beyond which an orbit touches, whatever shape it has by then."""
+_ROOM_TAKEN = 0.75
+"""Part of the room outside the healthy orbit that an orbit takes up by then. Where the sag takes nearly all
+of the clearance, the healthy orbit itself comes that near to the wall."""
 _BEYOND_1X = 0.02
 """Part of the healthy whirl that must move in addition to forward 1X where the clearance is filled."""
+_ROUND = 0.7
+"""Part of the clearance beyond which an orbit stays that whirls around its centre."""
+_2X_OF_CONTACT = 0.01
+"""Part of a change up to the wall that contact leaves at 2X, or more (finite-element rotors)."""
 _ORBIT_POINTS = 64
+_TURNING = np.exp(1j * np.outer(2.0 * np.pi * np.arange(_ORBIT_POINTS) / _ORBIT_POINTS, HARMONICS))
 _VISIBLE = 3.0
 
 
@@ -56,8 +64,49 @@ def marks_would_show(change: Complexes, variance: Floats) -> bool:
     return bool(_VISIBLE * np.sqrt(float(variance[TWICE].max())) < _LINEAR_2X * moved)
 
 
+def contact_would_show(change: Complexes, variance: Floats) -> bool:
+    """The same of a rub that holds the orbit at the wall.
+
+    Args:
+        change: complex128 ``[5]``, um.
+        variance: float64 ``[5]``, um^2.
+    """
+    moved = float(np.abs(change[[DC, FORWARD, BACKWARD]]).max())
+    return bool(_VISIBLE * np.sqrt(float(variance[TWICE].max())) < _2X_OF_CONTACT * moved)
+
+
+def reaches_wall(position: Complexes, healthy: Healthy) -> bool:
+    """Whether the orbit comes so much nearer to the wall that it touches, by what is known of the clearance.
+
+    Args:
+        position: complex128 ``[5]``, the present synchronous vector, um.
+        healthy: the machine before.
+    """
+    clearance_um = healthy.rotor.clearance_um
+    if clearance_um is None:
+        return False
+    reach, before = (float(np.abs(_TURNING @ one).max()) for one in (position, healthy.baseline))
+    return reach > max(_FILLED * clearance_um, before + _ROOM_TAKEN * (clearance_um - before))
+
+
+def whirls_around(position: Complexes, healthy: Healthy) -> bool:
+    """Whether the orbit goes around the clearance along its wall: contact that lasts leaves no harmonics.
+
+    Args:
+        position: complex128 ``[5]``, the present synchronous vector, um.
+        healthy: the machine before.
+    """
+    clearance_um = healthy.rotor.clearance_um
+    if clearance_um is None:
+        return False
+    around = 2.0 * abs(position[DC]) < np.abs(position[1:]).sum()
+    return bool(around and np.abs(_TURNING @ position).min() > _ROUND * clearance_um)
+
+
 def fills_clearance(position: Complexes, change: Complexes, variance: Floats, healthy: Healthy) -> bool:
     """Whether the orbit reaches the wall, and more than forward 1X has moved.
+
+    A shaft that only comes to rest beside the wall leaves no harmonics, and does not go around it.
 
     Args:
         position: complex128 ``[5]``, the present synchronous vector, um.
@@ -65,11 +114,12 @@ def fills_clearance(position: Complexes, change: Complexes, variance: Floats, he
         variance: float64 ``[5]``, um^2.
         healthy: the machine before.
     """
-    clearance_um = healthy.rotor.clearance_um
-    if clearance_um is None:
+    if not reaches_wall(position, healthy):
+        return False
+    if contact_would_show(change, variance) and not (
+        has_marks(change, variance) or whirls_around(position, healthy)
+    ):
         return False
     others = [DC, BACKWARD, *TWICE]
     least = 9.0 * variance[others] + (_BEYOND_1X * healthy.amplitude_um) ** 2
-    theta = 2.0 * np.pi * np.arange(_ORBIT_POINTS) / _ORBIT_POINTS
-    orbit = np.exp(1j * np.outer(theta, HARMONICS)) @ position
-    return bool(np.abs(orbit).max() > _FILLED * clearance_um and (np.abs(change[others]) ** 2 > least).any())
+    return bool((np.abs(change[others]) ** 2 > least).any())

@@ -81,6 +81,10 @@ _STIFFNESS_TOLERANCE = 0.3
 _FOLLOWS = np.array([0.1, 0.3])
 """Parts of a shift by which 1X may follow it where supports are stiffer the more they carry."""
 _FOLLOWING_NATS = 3.0
+_SHIFTS = np.geomspace(0.1, 10.0, 24)
+"""Ways that a load from an expected direction moves the shaft, in parts of the healthy orbit."""
+_FROM_ELSEWHERE = 0.2
+"""Probability that a load comes from another direction than the expected ones."""
 _SINKS = np.geomspace(0.02, 1.5, 12)
 """Parts of the sag that a shaft sinks by where no model gives how much of it is due to the softer part ..."""
 _SINKS_ASIDE = np.radians([-50.0, -25.0, 0.0, 25.0, 50.0])
@@ -122,16 +126,11 @@ def likelihoods(
         position: complex128 ``[5]``, the present synchronous vector in um, for the clearance.
         shaken: whether motion came with the change that does not repeat with the shaft.
     """
-    normal = float(log_density(change, variance).sum())
-    scores: dict[RotorFault, float] = {"normal": normal}
-    half = math.log(0.5)
-    scores["unbalance"] = _unbalance(change, variance, healthy) + half
-    scores["damping_loss"] = _damping_loss(change, variance, healthy) + half
-    scores["static_load"] = _static_load(change, variance, healthy)
-    scores["stiffness_loss"] = _stiffness_loss(change, variance, healthy)
+    scores = linear_faults(change, variance, healthy)
+    normal = scores["normal"]
     scores["unmodelled"] = float(
         np.logaddexp(
-            _unmodelled(change, variance, healthy) - UNMODELLED_NATS, crack(change, variance, healthy) - 1.0
+            anything(change, variance, healthy) - UNMODELLED_NATS, crack(change, variance, healthy) - 1.0
         )
     )
     scores["rub"], behind = _rub(change, variance, healthy, position, shaken=shaken)
@@ -139,6 +138,28 @@ def likelihoods(
         scores["rub"] = min(scores["rub"], max(scores[name] for name in scores.keys() - {"rub"}) - behind)
     # In the order of the names: ties go to the first.
     return {name: scores[name] - normal for name in FAULTS if name in scores}
+
+
+def linear_faults(
+    change: Complexes, variance: Floats, healthy: Healthy, *, load_towards: Complexes | None = None
+) -> dict[RotorFault, float]:
+    """Log marginal likelihood of no fault, and of each that leaves the rotor linear, in nats.
+
+    Args:
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, um.
+        variance: float64, as many, um^2.
+        healthy: the machine before.
+        load_towards: complex128 ``[L]``, unit vectors along which static loads are expected to move the
+            shaft; None: any direction is as likely.
+    """
+    half = math.log(0.5)
+    return {
+        "normal": float(log_density(change, variance).sum()),
+        "unbalance": _unbalance(change, variance, healthy) + half,
+        "damping_loss": _damping_loss(change, variance, healthy) + half,
+        "static_load": _static_load(change, variance, healthy, load_towards),
+        "stiffness_loss": _stiffness_loss(change, variance, healthy),
+    }
 
 
 def damping_misfit(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -235,19 +256,31 @@ def _damped(healthy: Healthy) -> tuple[Complexes, Complexes]:
     return before, mass * unbalance_response(speed / (omega[point] * frequency), zeta[point] * left)
 
 
-def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:
-    free = _free_static_load(change, variance, healthy)
+def _static_load(change: Complexes, variance: Floats, healthy: Healthy, towards: Complexes | None) -> float:
+    free = _free_static_load(change, variance, healthy, towards)
     rotor = healthy.rotor.two_modes
     if rotor is None or not on_film(healthy.rotor):
         return free
     rest = _still(change, variance, abs(change[DC]))
-    predicted = float(rest[BEYOND_1X].sum()) + _free(change[DC], variance[DC], healthy.amplitude_um)
+    predicted = float(rest[BEYOND_1X].sum()) + _shifted(change[DC], variance[DC], healthy, towards)
     return _besides(predicted + loaded(change, variance, healthy, rotor), free)
 
 
-def _free_static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+def _shifted(change: complex, variance: float, healthy: Healthy, towards: Complexes | None) -> float:
+    """Log density of the mean position under a static load, from anywhere or from where it is expected."""
+    free = _free(change, variance, healthy.amplitude_um)
+    if towards is None or not len(towards):
+        return free
+    shifts = np.outer(_SHIFTS * healthy.amplitude_um, towards).ravel()
+    expected = log_mean(log_density(change - shifts, variance + (_SINKS_WITHIN * np.abs(shifts)) ** 2))
+    return float(np.logaddexp(expected + math.log1p(-_FROM_ELSEWHERE), free + math.log(_FROM_ELSEWHERE)))
+
+
+def _free_static_load(
+    change: Complexes, variance: Floats, healthy: Healthy, towards: Complexes | None
+) -> float:
     score = _still(change, variance, abs(change[DC]))
-    score[DC] = _free(change[DC], variance[DC], healthy.amplitude_um)
+    score[DC] = _shifted(change[DC], variance[DC], healthy, towards)
     if not healthy.laval and healthy.rotor.plain_bearings is not False:
         # An oil film that carries more is stiffer: the orbit follows, by a part of the shaft's way.
         way = min(abs(change[DC]), healthy.amplitude_um)
@@ -346,7 +379,7 @@ def _rub(
     pulse = rub_pulse(change, variance, healthy, position)
     if fills_clearance(position, change, variance, healthy):
         # An orbit that fills the clearance touches, whatever shape it has by then.
-        return max(pulse, _unmodelled(change, variance, healthy) + UNMODELLED_NATS), 0.0
+        return max(pulse, anything(change, variance, healthy) + UNMODELLED_NATS), 0.0
     if shaken or has_marks(change, variance):
         return pulse, 0.0
     if marks_would_show(change, variance):
@@ -355,7 +388,14 @@ def _rub(
     return pulse, 0.0 if healthy.modelled else _HIDDEN_CONTACT_NATS
 
 
-def _unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+def anything(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    """Log marginal likelihood of a change of which every component moves by itself, or not at all.
+
+    Args:
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, um.
+        variance: float64, as many, um^2.
+        healthy: the machine before.
+    """
     moved = float(np.abs(change).max())
     still = _still(change, variance, moved)
     total = 0.0

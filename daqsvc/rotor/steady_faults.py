@@ -1,0 +1,171 @@
+"""Which faults of a live bank explain a steady change, by the signatures of the calibrated rotor.
+
+The steady motion of one mode each shows how far a change is from a few exact predictions. But real supports
+are none of them: an oil film gives way aside, a load comes from where it comes. The signatures
+(`daqsvc.rotor.synchronous.signatures`) average over what is not known of a fault, and over how far the two
+modes of a run-up may be off. A bank that has measured its healthy machine can ask them the same question.
+
+A rub is asked for otherwise. The bank knows the clearance, so its orbit has to reach the wall. There it
+leaves harmonics, or goes around.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.misfit import LEAST_REVOLUTIONS, Misfit
+from daqsvc.rotor.synchronous.contact import contact_would_show, has_marks, reaches_wall, whirls_around
+from daqsvc.rotor.synchronous.pulses import rub_pulse
+from daqsvc.rotor.synchronous.signatures import NAMED_BY_RUN_UP, UNMODELLED_NATS, anything, linear_faults
+from daqsvc.rotor.synchronous.vectors import DC, HARMONICS, Healthy
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.misfit import SteadyChange
+    from daqsvc.rotor.model import RotorParameters
+
+    Complexes = NDArray[np.complex128]
+    Flags = NDArray[np.bool_]
+    Floats = NDArray[np.float64]
+
+_ORDER = [2, 0, 1, 3, 4, 5, 6]
+"""Where the components of `daqsvc.rotor.synchronous.vectors.WITH_THRICE` are in a steady motion."""
+_ONLY_1X = frozenset({"unbalance", "damping_loss"})
+_OFF, _OFF_DC = 0.002, 0.01
+"""Parts of the healthy orbit by which components may be off, and the mean position, as probes drift."""
+_MOST_REVOLUTIONS = 128
+"""Revolutions after which a change that goes on is judged again."""
+
+
+class SteadyFaults:
+    """Judges steady changes of one machine.
+
+    Args:
+        rotor: the healthy rotor, with the two modes of its run-up.
+        faults: ``[M]``, what each mode of the bank is called: ``"normal"``, ``"rub"``, ...
+        motions: complex128 ``[M, 7]``, of `SteadyMotions`; the first is healthy. Its loads show from where
+            one is expected.
+        baseline: complex128 ``[7]``, the measured healthy motion, in clearances, in their order.
+        variance: float64 ``[7]``, of it, squared clearances.
+        speed_rad_s: shaft speed at which it was measured; negative if the shaft turns clockwise.
+    """
+
+    def __init__(
+        self,
+        rotor: RotorParameters,
+        faults: Sequence[str],
+        motions: Complexes,
+        *,
+        baseline: Complexes,
+        variance: Floats,
+        speed_rad_s: float,
+    ) -> None:
+        self._scale_um = rotor.clearance_um
+        self._faults = np.array(faults)
+        self._names = set(faults) - {"normal"}
+        self._variance = variance[_ORDER]
+        known = LavalRotor(
+            natural_frequency_hz=rotor.natural_frequency_hz,
+            damping_ratio=rotor.damping_ratio,
+            clearance_um=rotor.clearance_um,
+            static_sag_um=rotor.static_sag_um,
+            two_modes=replace(rotor, clearance_um=1.0),
+            plain_bearings=rotor.plain_bearings,
+        )
+        vector = self._scale_um * baseline[_ORDER]
+        self._healthy = Healthy(vector[: len(HARMONICS)], speed_rad_s, known, laval=False)
+        shifts = (motions - motions[0])[self._faults == "static_load", 2]
+        self._load_towards: Complexes = shifts[shifts != 0.0] / np.abs(shifts[shifts != 0.0])
+        self._likely: frozenset[str] | None = None
+        self._judged_samples, self._since = 0, 0
+
+    def look(self, change: SteadyChange) -> None:
+        """Judge a change that goes on: first at once, then as often as its length has doubled.
+
+        It is called once a revolution, and the signatures take longer than one at high speeds.
+        """
+        self._since += 1
+        renewed = change.samples >= 2 * self._judged_samples or change.samples < self._judged_samples
+        if (renewed and self._since >= LEAST_REVOLUTIONS) or self._since >= _MOST_REVOLUTIONS:
+            self._likely = self.likely(change)
+            self._judged_samples, self._since = change.samples, 0
+
+    def forget(self) -> None:
+        """The change is over."""
+        self._likely, self._judged_samples, self._since = None, 0, LEAST_REVOLUTIONS
+
+    def likely(self, change: SteadyChange) -> frozenset[str] | None:
+        """The faults of the bank that explain a change, none of them much better than the others.
+
+        None where it has no harmonics to judge by, where no fault explains it, or before it is there.
+        """
+        if len(change.moved) < len(_ORDER) or not np.isfinite(change.moved).all():
+            return None
+        scale, healthy = self._scale_um, self._healthy
+        moved = scale * change.moved[_ORDER]
+        of_mean = np.zeros(len(_ORDER)) if change.variance is None else change.variance[_ORDER]
+        off = np.full(len(_ORDER), _OFF * healthy.amplitude_um)
+        off[DC] = _OFF_DC * healthy.amplitude_um
+        variance = scale**2 * (self._variance + of_mean) + off**2
+        free = anything(moved, variance, healthy)
+        scores = linear_faults(moved, variance, healthy, load_towards=self._load_towards)
+        scores["rub"] = _rub(moved, variance, healthy, free)
+        known = {name: score for name, score in scores.items() if name in self._names}
+        best = max(known, key=lambda name: known[name])
+        margin = NAMED_BY_RUN_UP.margin_nats
+        if scores["normal"] > known[best] - margin or free - UNMODELLED_NATS > known[best] + margin:
+            return None
+        return frozenset(name for name, score in known.items() if known[best] - score < margin)
+
+    def narrowed(self, off: Misfit) -> Misfit:
+        """What a change excludes and leaves together by the signatures, where they have judged it.
+
+        Unbalance and loss of damping are told apart only where the modes' own motions agree.
+
+        Args:
+            off: the same by the modes' own motions.
+        """
+        return off if self._likely is None else narrowed(off, self._faults, self._likely)
+
+
+def narrowed(off: Misfit, faults: NDArray[np.str_], likely: Collection[str]) -> Misfit:
+    """What is excluded and left together of the modes, if only these faults are likely.
+
+    Args:
+        off: by the modes' own motions.
+        faults: ``[M]``, what each mode is called.
+        likely: of the faults, at least one.
+    """
+    names = set(likely)
+    pair = names & _ONLY_1X
+    if len(pair) == 1 and pair != set(faults[~off.excluded].tolist()) & _ONLY_1X:
+        names |= _ONLY_1X & set(faults.tolist())
+    close = np.isin(faults, list(names))
+    excluded = ~close
+    excluded[0] = off.excluded[0]
+    pairs = np.logical_and.outer(close, close) & (faults[:, np.newaxis] != faults)
+    return replace(off, excluded=excluded, pairs=pairs)
+
+
+def _rub(change: Complexes, variance: Floats, healthy: Healthy, free: float) -> float:
+    """Log marginal likelihood of a rub; `free`: of a change of which every component moves by itself.
+
+    A rub of a bank is an unbalance that has grown until the shaft touches. So 1X moves by more than the
+    wall's push, and where contact is certain, any change may be one.
+    """
+    position = healthy.baseline + change[: len(HARMONICS)]
+    if not reaches_wall(position, healthy):
+        return -math.inf
+    pulse = rub_pulse(change, variance, healthy, position)
+    vector, of_vector = change[: len(HARMONICS)], variance[: len(HARMONICS)]
+    if has_marks(vector, of_vector) or whirls_around(position, healthy):
+        return max(pulse, free + UNMODELLED_NATS)
+    return -math.inf if contact_would_show(vector, of_vector) else max(pulse, free)
