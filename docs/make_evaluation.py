@@ -185,9 +185,10 @@ def rotors(docs: Path) -> Iterator[Row]:
             "rotor bank from a run-up",
             {
                 "right": "named right",
-                "right of predicted": "named right, of those that are predicted to be named alone",
                 "told": "truth in the group",
                 "wrong": "wrong",
+                "alone": "only the true fault named, of all changes",
+                "alone, of predicted": "only the true fault named, of those for which it is predicted",
                 "not seen": "not seen",
                 "false alarms": "false alarms",
             },

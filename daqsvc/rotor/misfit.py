@@ -40,6 +40,7 @@ LEAST_REVOLUTIONS = 8
 """Revolutions that a motion has to be steady for."""
 _PARTS, _COMPONENTS = 3, 7
 """Of a motion: those that the model may miss, and all with 2X and 3X."""
+_NOT_KNOWN = (math.nan,) * (_COMPONENTS - _PARTS)
 _EXPLAINS = 0.4
 """Part of a change that a fault may miss and still be taken for its cause."""
 _FROM_A_LEVEL = frozenset({"normal", "rub"})
@@ -144,17 +145,17 @@ def _of_rub(observer: np.void, coupling: np.void, duration: float) -> Complexes:
         whole = fit.samples == part.stop - part.start
         if not whole or np.hypot(*xy[part].T).max() < 1.0:
             return np.full(_COMPONENTS, np.nan, dtype=np.complex128)
-        halves.append(_components(fit.solve().with_harmonics(xy[part], cos[part], sin[part])))
+        halves.append(_all_components([fit.solve().with_harmonics(xy[part], cos[part], sin[part])])[0])
     before, after = halves
     if not np.linalg.norm((after - before)[:_PARTS]) <= _UNSTEADY * np.linalg.norm(after[:_PARTS]):
         return np.full(_COMPONENTS, np.nan, dtype=np.complex128)
     return np.asarray((before + after) / 2.0)
 
 
-def _components(motion: SteadyMotion) -> Complexes:
-    """Complex128 ``[7]``, as of `SteadyMotions.of`; NaN are the harmonics that are not known."""
-    harmonics = motion.harmonics or (math.nan,) * (_COMPONENTS - _PARTS)
-    return np.array([motion.forward, motion.backward, motion.rest, *harmonics])
+def _all_components(motions: Sequence[SteadyMotion]) -> Complexes:
+    """Complex128 ``[R, 7]``, as of `SteadyMotions.of`; NaN are the harmonics that are not known."""
+    rows = [(one.forward, one.backward, one.rest, *(one.harmonics or _NOT_KNOWN)) for one in motions]
+    return np.array(rows, dtype=np.complex128).reshape(-1, _COMPONENTS)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -216,7 +217,7 @@ def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes, noise: fl
     count = len(motions)
     if count < LEAST_REVOLUTIONS:
         return None
-    whole = np.array([_components(one)[: len(healthy)] for one in motions]) - healthy
+    whole = _all_components(motions)[:, : len(healthy)] - healthy
     sizes = np.array([one.samples for one in motions])
     while count >= LEAST_REVOLUTIONS:
         parts, samples = whole[-count:], int(sizes[-count:].sum())
@@ -240,7 +241,7 @@ def steady_baseline(motions: Sequence[SteadyMotion], noise: float) -> tuple[Comp
     Returns:
         complex128 and float64 ``[7]``, in clearances and their square; None where harmonics are not known.
     """
-    parts = np.array([_components(one) for one in motions]).reshape(-1, _COMPONENTS)
+    parts = _all_components(motions)
     parts = parts[np.isfinite(parts).all(axis=1)]
     if len(parts) < LEAST_REVOLUTIONS:
         return None

@@ -93,15 +93,19 @@ class BankSaid:
         return self.moved >= CLEAR
 
     @property
-    def right_or_pair(self) -> bool:
-        """The same as `right`, with unbalance and damping loss as one, as of the calibrated rotor."""
-        true = ONLY_1X if self.fault in ONLY_1X else {self.fault}
-        return self.fault_said in true and set(self.group) <= true
+    def true_names(self) -> frozenset[str]:
+        """Names that are true of the fault; unbalance and damping loss count as one, as elsewhere."""
+        return ONLY_1X if self.fault in ONLY_1X else frozenset({self.fault})
 
     @property
     def right(self) -> bool:
-        """Whether it is what happened, and nothing else; a healthy machine may look like a fault."""
-        return self.fault_said == self.fault and (self.fault == "healthy" or set(self.group) == {self.fault})
+        """Whether it has its name, and no other."""
+        return self.fault_said in self.true_names and set(self.group) <= self.true_names
+
+    @property
+    def told(self) -> bool:
+        """Whether what happened is among what was said."""
+        return bool(self.true_names.intersection(self.group))
 
     @property
     def wrong(self) -> bool:
@@ -109,9 +113,14 @@ class BankSaid:
         return self.fault_said not in {"", "healthy"} and not self.told
 
     @property
-    def told(self) -> bool:
-        """Whether what happened is among what was said."""
-        return self.fault in self.group
+    def alone(self) -> bool:
+        """Whether it is what happened, and nothing else; a healthy machine may look like a fault."""
+        return self.fault_said == self.fault and (self.fault == "healthy" or set(self.group) == {self.fault})
+
+    @property
+    def other(self) -> bool:
+        """Whether it has a name, and what happened is not in the group by its own name."""
+        return self.fault_said not in {"", "healthy"} and self.fault not in self.group
 
 
 def _modes(rotor: RotorParameters, speed_rpm: float, whirl_um: float) -> list[RotorMode]:
@@ -253,15 +262,18 @@ def bank_summary(said: Sequence[BankSaid]) -> list[str]:
     columns = (
         "SNR",
         "right",
-        "right, counted as above",
-        "right of predicted",
         "told",
         "wrong",
+        "alone",
+        "another",
+        "alone, of predicted",
         "not seen",
         "healthy right",
         "false alarms",
+        "onset off",
+        "delay ratio",
     )
-    lines = [f"| {' | '.join(columns)} | onset off | delay ratio |", "|---" * (len(columns) + 2) + "|"]
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for snr in SNR_DB:
         at = [one for one in said if one.snr_db == snr]
         faults = [one for one in at if one.fault != "healthy"]
@@ -275,12 +287,12 @@ def bank_summary(said: Sequence[BankSaid]) -> list[str]:
             return f"{100.0 * sum(map(of, runs)) / len(runs):.1f} %"
 
         lines.append(
-            f"| {snr} dB | {share(lambda one: one.right, faults)} | "
-            f"{share(lambda one: one.right_or_pair, clear)} of {len(clear)} | "
-            f"{share(lambda one: one.right, predicted)} of {len(predicted)} | "
-            f"{share(lambda one: one.told, faults)} | "
-            f"{share(lambda one: one.wrong, faults)} of {len(faults)} | "
-            f"{share(lambda one: one.delay is None, faults)} | {share(lambda one: one.right, healthy)} | "
+            f"| {snr} dB | {share(lambda one: one.right, clear)} | {share(lambda one: one.told, clear)} | "
+            f"{share(lambda one: one.wrong, clear)} of {len(clear)} | "
+            f"{share(lambda one: one.alone, faults)} | {share(lambda one: one.other, faults)} | "
+            f"{share(lambda one: one.alone, predicted)} of {len(predicted)} | "
+            f"{share(lambda one: one.delay is None, faults)} of {len(faults)} | "
+            f"{share(lambda one: one.alone, healthy)} | "
             f"{sum(one.false_alarms for one in at)} in {ONSET_REV * len(at)} revolutions | "
             f"{np.median(off):.2f} rev | {np.median(both):.2f} |"
         )

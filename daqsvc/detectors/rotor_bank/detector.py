@@ -57,6 +57,8 @@ _RETUNE = 0.003
 """Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
 _SAME_SPEED = 0.02
 """Relative difference from the speed of the calibration up to which its motion is the healthy one."""
+_FEW_REVOLUTIONS = 32
+"""Whose steady motion shows whether a machine that the observers take for healthy has changed."""
 _PREDICTED_REVOLUTIONS = 100.0
 """Over which a steady motion is predicted: a change is there for as long, or longer."""
 _BLIND_REVOLUTIONS = 3.0
@@ -403,9 +405,10 @@ class RotorBankDetector:
             return
         nearby = hunting(self._bank_modes[0].rotor, bank.speed)
         healthy = np.concatenate((nearby[len(nearby) // 2], self._harmonics))
-        change = steady_change(self._watch.motions, healthy, self._noise)
+        motions, changed = self._watch.motions, bank.decision != 0 or report.departure is not None
+        change = steady_change(motions if changed else motions[-_FEW_REVOLUTIONS:], healthy, self._noise)
         certain = change is not None and self._at_calibrated_speed and change.is_certain(nearby, self._noise)
-        if bank.decision == 0 and report.departure is None and not certain:
+        if not (changed or certain):
             self._misfit = math.nan
             bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
             if self._steady_faults is not None:
