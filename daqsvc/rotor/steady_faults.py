@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.rotor.adaptation import MODEL_ERROR
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.misfit import LEAST_REVOLUTIONS, Misfit
 from daqsvc.rotor.synchronous.contact import contact_would_show, has_marks, reaches_wall, whirls_around
@@ -124,6 +125,22 @@ class SteadyFaults:
         if scores["normal"] > known[best] - margin or free - UNMODELLED_NATS > known[best] + margin:
             return None
         return frozenset(name for name, score in known.items() if known[best] - score < margin)
+
+    def predicted(self, change: SteadyChange) -> frozenset[str] | None:
+        """The same of a change that the model predicts: all that it may be called if the model is off.
+
+        Args:
+            change: from healthy to where a mode takes the machine.
+        """
+        found = self.likely(change)
+        if found is None:
+            return None
+        for quarter in range(4):
+            off = np.ones(len(_ORDER), dtype=np.complex128)
+            turned = MODEL_ERROR * 1j**quarter
+            off[:3] += turned, turned.conjugate(), MODEL_ERROR * (-1) ** quarter
+            found |= self.likely(replace(change, moved=off * change.moved)) or frozenset()
+        return found
 
     def narrowed(self, off: Misfit) -> Misfit:
         """What a change excludes and leaves together by the signatures, where they have judged it.

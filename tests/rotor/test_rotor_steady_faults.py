@@ -271,3 +271,23 @@ def test_a_baseline_and_a_change_know_their_scatter():
     quiet = steady_baseline([motions[0]] * 40, 0.01)
     assert quiet is not None
     np.testing.assert_allclose(quiet[1], 2.0 * 0.01**2 / (40 * 64))
+
+
+@pytest.mark.parametrize(("machine", "own"), LINEAR)
+def test_what_is_predicted_is_what_an_exact_machine_would_be_called(machine, own):
+    before = vector_of(MACHINE, SPEED_HZ)
+    predicted = judge(before).predicted(
+        SteadyChange(motion(vector_of(machine, SPEED_HZ) - before), 6400, VARIANCE)
+    )
+    assert predicted is not None
+    assert predicted >= own
+    assert judge(before).predicted(SteadyChange(np.zeros(7), 6400, VARIANCE)) is None
+
+
+def test_what_is_predicted_allows_for_the_error_of_the_model():
+    # A little more unbalance in noise is just told from weaker dampers, and not if the model is a little off.
+    before = vector_of(MACHINE, SPEED_HZ)
+    grown = vector_of(replace(MACHINE, eccentricity_um=1.15 * MACHINE.eccentricity_um), SPEED_HZ)
+    change = SteadyChange(motion(grown - before), 6400, 17.0 * VARIANCE)
+    assert judge(before).likely(change) == {"unbalance"}
+    assert judge(before).predicted(change) == {"unbalance", "damping_loss"}

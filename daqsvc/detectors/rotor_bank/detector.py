@@ -464,7 +464,7 @@ class RotorBankDetector:
             if not np.isfinite(change.moved).all():
                 continue
             off = self._compared(change, motions)
-            likely = None if steady_faults is None else steady_faults.likely(change)
+            likely = None if steady_faults is None else steady_faults.predicted(change)
             if likely is not None:
                 off = narrowed(off, faults, likely)
             # No steady motion is compared of a machine that all observers take for the healthy one.
