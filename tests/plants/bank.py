@@ -14,7 +14,7 @@ import zlib
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +34,7 @@ from daqsvc.rotor.model import RotorParameters
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -146,6 +146,62 @@ def _modes(rotor: RotorParameters, speed_rpm: float, whirl_um: float) -> list[Ro
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class _Shaft:
+    """A machine at a speed: what its records have in common."""
+
+    geometry: str
+    speed_rpm: float
+    clearance_um: float
+    whirl_um: float
+
+    @staticmethod
+    def of(case: Case) -> _Shaft:
+        figures = (float(case[name]) for name in ("speed_rpm", "clearance_um", "whirl_um"))  # type: ignore[arg-type]
+        return _Shaft(str(case["geometry"]), *figures)
+
+    @property
+    def rate_hz(self) -> float:
+        return self.speed_rpm / 60.0 * PER_REV
+
+
+def _detector(folder: Path, seed: int, shaft: _Shaft, noise_um: float) -> RotorBankDetector:
+    """The bank of a machine at a speed, its observers made from the run-up."""
+    _, fit = identified(folder, shaft.geometry, seed)
+    rotor = fit.rotor(
+        RotorParameters(
+            natural_frequency_hz=fit.natural_frequency_hz,
+            damping_ratio=fit.damping_ratio,
+            eccentricity_um=1.0,
+            clearance_um=shaft.clearance_um,
+            static_sag_um=1e6 * STANDARD_GRAVITY_M_S2 / (math.tau * fit.natural_frequency_hz) ** 2,
+            contact_stiffness=_STATOR,
+            friction=_FRICTION,
+            plain_bearings="journals" in shaft.geometry,
+        )
+    )
+    return RotorBankDetector(
+        machine=shaft.geometry,
+        stream="shaft",
+        rate_hz=shaft.rate_hz,
+        speed_rpm=shaft.speed_rpm,
+        probes=(Probe("x", 0, 0.0), Probe("y", 1, 90.0)),
+        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
+        rotor=rotor,
+        modes=_modes(rotor, shaft.speed_rpm, shaft.whirl_um),
+        noise_um=noise_um,
+        calibrate_revolutions=40,
+        rules=_RULES,
+    )
+
+
+@lru_cache(maxsize=8)
+def _predicted(folder: Path, seed: int, shaft: _Shaft, snr_db: int) -> Mapping[str, tuple[str, ...]]:
+    """What the bank predicts that it says of each mode, in noise by the healthy whirl."""
+    noise_um = shaft.whirl_um / math.sqrt(2.0) / 10.0 ** (snr_db / 20.0)
+    return _detector(folder, seed, shaft, noise_um).predicted_groups()
+
+
 def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
     """Run the bank over a record."""
     case, snr_db = job
@@ -156,35 +212,9 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
     noise_um = math.sqrt(float(np.var(z[: ONSET_REV * PER_REV])) / 2.0 / 10.0 ** (snr_db / 10.0))
     z = z + noise_um * (rng.standard_normal(len(z)) + 1j * rng.standard_normal(len(z)))
     samples = np.stack((z.real, z.imag, keyphasor_volts(angle, rng)), axis=1).astype(np.float32)
-    _, fit = identified(folder, str(case["geometry"]), seed)
-    speed_rpm = float(case["speed_rpm"])  # type: ignore[arg-type]
-    rotor = fit.rotor(
-        RotorParameters(
-            natural_frequency_hz=fit.natural_frequency_hz,
-            damping_ratio=fit.damping_ratio,
-            eccentricity_um=1.0,
-            clearance_um=float(case["clearance_um"]),  # type: ignore[arg-type]
-            static_sag_um=1e6 * STANDARD_GRAVITY_M_S2 / (math.tau * fit.natural_frequency_hz) ** 2,
-            contact_stiffness=_STATOR,
-            friction=_FRICTION,
-            plain_bearings="journals" in str(case["geometry"]),
-        )
-    )
-    rate_hz = speed_rpm / 60.0 * PER_REV
-    detector = RotorBankDetector(
-        machine=str(case["geometry"]),
-        stream="shaft",
-        rate_hz=rate_hz,
-        speed_rpm=speed_rpm,
-        probes=(Probe("x", 0, 0.0), Probe("y", 1, 90.0)),
-        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
-        rotor=rotor,
-        modes=_modes(rotor, speed_rpm, float(case["whirl_um"])),  # type: ignore[arg-type]
-        noise_um=noise_um,
-        calibrate_revolutions=40,
-        rules=_RULES,
-    )
-    predicted = detector.predicted_groups()
+    detector = _detector(folder, seed, _Shaft.of(case), noise_um)
+    rate_hz = _Shaft.of(case).rate_hz
+    predicted = _predicted(folder, seed, _Shaft.of(case), snr_db)
     alarms, delay, onset, before, end = 0, None, None, "", None
     for begin in range(0, len(samples), detector.block):
         for said in detector.process(window_of(samples[begin : begin + detector.block], begin, rate_hz)):
@@ -210,9 +240,8 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
         delay=delay,
         told_delay=_told_delay(detector, z, angle, fault),
         onset_error=onset,
-        predicted=all(
-            stated == (fault,) for mode, stated in predicted.items() if mode.rsplit(" ", 1)[0] == fault
-        ),
+        predicted={stated for mode, stated in predicted.items() if mode.rsplit(" ", 1)[0] == fault}
+        == {(fault,)},
         moved=moved,
     )
 
