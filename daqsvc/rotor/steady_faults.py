@@ -106,7 +106,7 @@ class SteadyFaults:
     def likely(self, change: SteadyChange) -> frozenset[str] | None:
         """The faults of the bank that explain a change, none of them much better than the others.
 
-        None where it has no harmonics to judge by, where no fault explains it, or before it is there.
+        None where it has no harmonics to judge by, where none of them explains it, or before it is there.
         """
         if len(change.moved) < len(_ORDER) or not np.isfinite(change.moved).all():
             return None
@@ -122,7 +122,9 @@ class SteadyFaults:
         known = {name: score for name, score in scores.items() if name in self._names}
         best = max(known, key=lambda name: known[name])
         margin = NAMED_BY_RUN_UP.margin_nats
-        if scores["normal"] > known[best] - margin or free - UNMODELLED_NATS > known[best] + margin:
+        # It may also be a fault that the bank has no mode of.
+        other = max(free - UNMODELLED_NATS, *scores.values())
+        if scores["normal"] > known[best] - margin or other > known[best] + margin:
             return None
         return frozenset(name for name, score in known.items() if known[best] - score < margin)
 
