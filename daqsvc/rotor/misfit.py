@@ -214,21 +214,25 @@ def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes, noise: fl
         healthy: complex128 ``[3]`` or, with harmonics, ``[7]``, the healthy mode's.
         noise: standard deviation of the measured position, in clearances.
     """
-    count = len(motions)
-    if count < LEAST_REVOLUTIONS:
+    counts: list[int] = []
+    while (count := len(motions) >> len(counts)) >= LEAST_REVOLUTIONS:
+        counts.append(count)
+    if not counts:
         return None
     whole = _all_components(motions)[:, : len(healthy)] - healthy
     sizes = np.array([one.samples for one in motions])
-    while count >= LEAST_REVOLUTIONS:
+    found = None
+    # From the fewest on: of many, the halves may agree though the machine went and came back.
+    for count in reversed(counts):
         parts, samples = whole[-count:], int(sizes[-count:].sum())
         moved = parts.mean(axis=0)
         drift = (parts[count // 2 :].mean(axis=0) - parts[: count // 2].mean(axis=0))[:_PARTS]
         # The mean of half the samples has a variance of 4 noise^2 / samples in each of its parts.
         by_noise = _SIGNIFICANT * noise * math.sqrt(8.0 * _PARTS / samples)
-        if np.linalg.norm(drift) <= max(_UNSTEADY * float(np.linalg.norm(moved[:_PARTS])), by_noise):
-            return SteadyChange(moved, samples, _of_mean(parts, samples, noise))
-        count //= 2
-    return None
+        if not np.linalg.norm(drift) <= max(_UNSTEADY * float(np.linalg.norm(moved[:_PARTS])), by_noise):
+            break
+        found = SteadyChange(moved, samples, _of_mean(parts, samples, noise))
+    return found
 
 
 def steady_baseline(motions: Sequence[SteadyMotion], noise: float) -> tuple[Complexes, Floats] | None:

@@ -106,12 +106,15 @@ class SteadyFaults:
     def likely(self, change: SteadyChange) -> frozenset[str] | None:
         """The faults of the bank that explain a change, none of them much better than the others.
 
-        None where it has no harmonics to judge by, where none of them explains it, or before it is there.
+        None where it has no harmonics to judge by, where none of them explains it, where it is small, and
+        before it is there.
         """
         if len(change.moved) < len(_ORDER) or not np.isfinite(change.moved).all():
             return None
         scale, healthy = self._scale_um, self._healthy
         moved = scale * change.moved[_ORDER]
+        if np.linalg.norm(moved) < NAMED_BY_RUN_UP.least_severity * healthy.amplitude_um:
+            return None
         of_mean = np.zeros(len(_ORDER)) if change.variance is None else change.variance[_ORDER]
         off = np.full(len(_ORDER), _OFF * healthy.amplitude_um)
         off[DC] = _OFF_DC * healthy.amplitude_um

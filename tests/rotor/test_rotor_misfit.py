@@ -133,6 +133,14 @@ def test_a_change_is_steady_as_long_as_its_halves_agree():
     assert long.samples == 32 * PER_REV
 
 
+def test_a_machine_that_went_and_came_back_is_not_steady_for_as_long():
+    before, after = MOTIONS[0], MOTIONS[3]
+    back = steady_change(revolutions((before, 32), (after, 64), (before, 32)), before, NOISE)
+    assert back is not None
+    assert back.samples == 32 * PER_REV
+    np.testing.assert_allclose(back.moved, np.zeros(3), atol=1e-12)
+
+
 def test_a_change_that_noise_hides_is_a_steady_one_of_nothing():
     rng = np.random.default_rng(1)
     sigma = NOISE / math.sqrt(PER_REV)

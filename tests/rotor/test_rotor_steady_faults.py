@@ -164,6 +164,14 @@ def test_before_there_is_a_change_nothing_is_excluded_by_it():
     assert likely(before + 0.001 * np.abs(before[1])) is None
 
 
+@pytest.mark.parametrize(("part", "expected"), [(1.03, None), (1.1, {"unbalance"})])
+def test_a_small_change_gets_no_name_however_clear_it_is(part, expected):
+    grown = replace(MACHINE, eccentricity_um=part * MACHINE.eccentricity_um)
+    before, after = (vector_of(one, SPEED_HZ) for one in (MACHINE, grown))
+    clear = SteadyChange(motion(after - before), 10**6, 1e-4 * VARIANCE)
+    assert judge(before).likely(clear) == expected
+
+
 def test_without_harmonics_nothing_is_judged():
     before = vector_of(MACHINE, SPEED_HZ)
     moved = motion(vector_of(GROWN, SPEED_HZ) - before)
@@ -256,7 +264,7 @@ def test_few_samples_in_a_revolution_show_no_harmonics():
 
 def test_a_baseline_and_a_change_know_their_scatter():
     rng = np.random.default_rng(3)
-    parts = 1.0 + 0.1 * (rng.standard_normal((40, 7)) + 1j * rng.standard_normal((40, 7)))
+    parts = 1.0 + 0.02 * (rng.standard_normal((40, 7)) + 1j * rng.standard_normal((40, 7)))
     motions = [SteadyMotion(*part[:3], 64, tuple(part[3:])) for part in parts]
     baseline = steady_baseline(motions, 1e-3)
     assert baseline is not None
