@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.rotor.synchronous.vectors import LEAST_SAMPLES_OF_3X
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -29,8 +31,6 @@ VARIANCE_FACTOR = 1.5
 allows for errors of natural frequency and damping of a few per cent."""
 MODEL_ERROR = 0.1
 """Part of the healthy orbit that a rotor with two modes may be off by after a fault."""
-_LEAST_SAMPLES_OF_3X = 16
-"""Samples in a revolution with which 3X is well separated from the other components."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class SteadyMotion:
             cos: float64 ``[n]``, cosine of the shaft angle.
             sin: float64 ``[n]``, its sine.
         """
-        if self.samples < _LEAST_SAMPLES_OF_3X:
+        if self.samples < LEAST_SAMPLES_OF_3X:
             return self
         turn, z = _there(xy, cos, sin)
         left = z - (self.forward * turn + self.backward * turn.conj() + self.rest)

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from daqsvc.rotor.model import RotorParameters
 
     Complexes = NDArray[np.complex128]
-    Flags = NDArray[np.bool_]
     Floats = NDArray[np.float64]
 
 _ORDER = [2, 0, 1, 3, 4, 5, 6]
@@ -84,7 +83,8 @@ class SteadyFaults:
         vector = self._scale_um * baseline[_ORDER]
         self._healthy = Healthy(vector[: len(HARMONICS)], speed_rad_s, known, laval=False)
         shifts = (motions - motions[0])[self._faults == "static_load", 2]
-        self._load_towards: Complexes = shifts[shifts != 0.0] / np.abs(shifts[shifts != 0.0])
+        shifts = shifts[np.isfinite(shifts) & (shifts != 0.0)]  # a shaft that may touch and does not has none
+        self._load_towards: Complexes = shifts / np.abs(shifts)
         self._likely: frozenset[str] | None = None
         self._judged_samples, self._since = 0, 0
 
@@ -171,10 +171,10 @@ def narrowed(off: Misfit, faults: NDArray[np.str_], likely: Collection[str]) -> 
     if len(pair) == 1 and pair != set(faults[~off.excluded].tolist()) & _ONLY_1X:
         names |= _ONLY_1X & set(faults.tolist())
     close = np.isin(faults, list(names))
-    excluded = ~close
-    excluded[0] = off.excluded[0]
+    # The healthy mode is excluded, too: what is judged is a change. Else it would win where the motion is
+    # that of no mode, and the change would be found and lost again and again.
     pairs = np.logical_and.outer(close, close) & (faults[:, np.newaxis] != faults)
-    return replace(off, excluded=excluded, pairs=pairs)
+    return replace(off, excluded=~close, pairs=pairs)
 
 
 def _rub(change: Complexes, variance: Floats, healthy: Healthy, free: float) -> float:

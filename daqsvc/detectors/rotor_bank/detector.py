@@ -339,6 +339,8 @@ class RotorBankDetector:
         verdict = self._verdict()
         self._follow_speed(float(angle[0]))
         unsure = self._bank.decision == UNDETERMINED and not self._watch.confirmed
+        if verdict.quality != "good":
+            self._watch.spoil()
         if verdict.quality != "good" or unsure:
             xy[:] = np.nan
 
@@ -405,7 +407,7 @@ class RotorBankDetector:
             return
         nearby = hunting(self._bank_modes[0].rotor, bank.speed)
         healthy = np.concatenate((nearby[len(nearby) // 2], self._harmonics))
-        motions, changed = self._watch.motions, bank.decision != 0 or report.departure is not None
+        motions, changed = self._watch.sound_motions, bank.decision != 0 or report.departure is not None
         change = steady_change(motions if changed else motions[-_FEW_REVOLUTIONS:], healthy, self._noise)
         certain = change is not None and self._at_calibrated_speed and change.is_certain(nearby, self._noise)
         if not (changed or certain):
@@ -491,7 +493,7 @@ class RotorBankDetector:
         self._bank_modes, self._calibrated_speed = adapted(self._bank_modes, motion, speed), speed
         self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
         self._steady_motions = SteadyMotions(self._duration)
-        measured = steady_baseline(self._watch.motions[-self._calibrate_revolutions :], self._noise)
+        measured = steady_baseline(self._watch.sound_motions[-self._calibrate_revolutions :], self._noise)
         if measured is not None:
             baseline, variance = measured
             self._steady_faults, self._harmonics = self._judge_steady(baseline, variance), baseline[3:]

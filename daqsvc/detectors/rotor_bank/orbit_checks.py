@@ -73,6 +73,7 @@ class OrbitWatch:
         self._covered = 0
         self._forward = False
         self._motions: deque[SteadyMotion] = deque(maxlen=_KEPT_REVOLUTIONS)
+        self._sound, self._spoilt = 0, False
         self._doubt = ""
         self._unclear = ""
 
@@ -94,8 +95,9 @@ class OrbitWatch:
         fit.add(xy, cos, sin)
         if fit.samples > revolution // 2:
             self._motions.append(fit.solve().with_harmonics(xy, cos, sin))
+            self._sound = 0 if self._spoilt else self._sound + 1
             self._look()
-        self._blocks, self._covered = [], 0
+        self._blocks, self._covered, self._spoilt = [], 0, False
 
     @property
     def confirmed(self) -> bool:
@@ -106,10 +108,18 @@ class OrbitWatch:
         """
         return self._forward
 
+    def spoil(self) -> None:
+        """The last block is not good: the revolutions with it, and all before, are no motion to compare."""
+        self._sound, self._spoilt = 0, bool(self._blocks)
+
     @property
-    def motions(self) -> list[SteadyMotion]:
-        """Of the last revolutions, 128 at most, the oldest first; with harmonics."""
-        return list(self._motions)
+    def sound_motions(self) -> list[SteadyMotion]:
+        """Of the revolutions since the last block that was not good, 128 at most, the oldest first."""
+        return list(self._motions)[len(self._motions) - min(self._sound, len(self._motions)) :]
+
+    @property
+    def _latest(self) -> list[SteadyMotion]:
+        return list(self._motions)[-_SLIP_REVOLUTIONS:]
 
     def doubt(self) -> str:
         """What cannot be true, with the remedy; empty if nothing is wrong."""
@@ -117,7 +127,7 @@ class OrbitWatch:
 
     def _look(self) -> None:
         """Look at the orbit with one more revolution."""
-        motions = list(self._motions)[-_SLIP_REVOLUTIONS:]
+        motions = self._latest
         if not self._forward:
             forward = _radius([motion.forward for motion in motions])
             backward = _radius([motion.backward for motion in motions])
@@ -151,7 +161,7 @@ class OrbitWatch:
         )
 
     def _static_position(self) -> str:
-        motions = list(self._motions)[-_SLIP_REVOLUTIONS:]
+        motions = self._latest
         if self._static_seen or len(motions) < _DC_REVOLUTIONS:
             return ""
         expected = abs(self._expected_rest)
@@ -168,7 +178,7 @@ class OrbitWatch:
         )
 
     def _slip(self) -> str:
-        motions = list(self._motions)[-_SLIP_REVOLUTIONS:]
+        motions = self._latest
         if len(motions) < _SLIP_REVOLUTIONS:
             return ""
         forward = np.array([motion.forward for motion in motions])

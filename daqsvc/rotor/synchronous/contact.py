@@ -60,8 +60,7 @@ def marks_would_show(change: Complexes, variance: Floats) -> bool:
         change: complex128 ``[5]``, um.
         variance: float64 ``[5]``, um^2.
     """
-    moved = float(np.abs(change[[FORWARD, BACKWARD]]).max())
-    return bool(_VISIBLE * np.sqrt(float(variance[TWICE].max())) < _LINEAR_2X * moved)
+    return _visible(_LINEAR_2X * float(np.abs(change[[FORWARD, BACKWARD]]).max()), variance)
 
 
 def contact_would_show(change: Complexes, variance: Floats) -> bool:
@@ -71,8 +70,12 @@ def contact_would_show(change: Complexes, variance: Floats) -> bool:
         change: complex128 ``[5]``, um.
         variance: float64 ``[5]``, um^2.
     """
-    moved = float(np.abs(change[[DC, FORWARD, BACKWARD]]).max())
-    return bool(_VISIBLE * np.sqrt(float(variance[TWICE].max())) < _2X_OF_CONTACT * moved)
+    return _visible(_2X_OF_CONTACT * float(np.abs(change[[DC, FORWARD, BACKWARD]]).max()), variance)
+
+
+def _visible(twice_um: float, variance: Floats) -> bool:
+    """Whether 2X of this size would be seen in the noise."""
+    return bool(_VISIBLE * np.sqrt(float(variance[TWICE].max())) < twice_um)
 
 
 def reaches_wall(position: Complexes, healthy: Healthy) -> bool:

@@ -41,7 +41,7 @@ WITH_THRICE = (*HARMONICS, 3, -3)
 
 _LEAST_SHARE = 0.75
 """Part of a revolution's samples that must be there."""
-_LEAST_SAMPLES_OF_3X = 16.0
+LEAST_SAMPLES_OF_3X = 16.0
 """Samples in a revolution with which 3X is well separated from the other components."""
 _WORST_CONDITION = 2.5
 """Largest spread of the normal equations' eigenvalues: missing samples must not lie in one piece too long.
@@ -158,7 +158,7 @@ def synchronous_vectors(revolutions: Revolutions) -> SynchronousVectors:
     explained = spectrum[:, order[np.newaxis, :] - beyond[:, np.newaxis] + 5]
     thrice = np.stack([total(z * np.conj(_power(powers, k))) for k in (3, -3)], axis=-1)
     thrice = (thrice - np.einsum("rjk,rk->rj", explained, vectors)) / np.maximum(samples, 1.0)[:, np.newaxis]
-    thrice[~usable | (samples < _LEAST_SAMPLES_OF_3X)] = np.nan
+    thrice[~usable | (samples < LEAST_SAMPLES_OF_3X)] = np.nan
     return SynchronousVectors(
         vectors,
         noise,

@@ -240,6 +240,39 @@ def test_a_bank_whose_modes_are_several_faults_in_one_is_judged_by_its_modes(cal
     assert judged
 
 
+@pytest.mark.parametrize("aside_um", [10.0, 20.0])
+def test_a_load_from_the_side_is_one_load_and_no_coming_and_going(calibrated, aside_um):
+    # No mode of the bank moves so. The observers of the healthy machine are the nearest, and it has changed.
+    loaded = replace(MACHINE, load=MACHINE.load + aside_um)
+    detector, said = said_of(machine_of(calibrated), [MACHINE, loaded, loaded])
+    decisions = [one.decision for one in said if one.revolutions > 90]
+    assert len(set(decisions)) == 1
+    assert {detector.faults[name] for name in (said[-1].decision, *said[-1].group)} == {"static_load"}
+
+
+def test_a_load_mode_that_may_touch_leaves_a_load_a_load(calibrated):
+    load = 'fault = "static_load", static_load_um = [0.0, -20.0]'
+    touching = f'{{ name = "RL", {load}, rub = true, severity = "alert" }}'
+    detector, said = said_of(
+        machine_of(calibrated, ('{ name = "K1"', f'{touching},\n  {{ name = "K1"')),
+        [MACHINE, replace(MACHINE, load=1.5 * MACHINE.load)],
+    )
+    assert {detector.faults[name] for name in (said[-1].decision, *said[-1].group)} == {"static_load"}
+
+
+def test_revolutions_of_a_bad_probe_are_no_steady_motion(calibrated):
+    machine = machine_of(calibrated)
+    detector = bank_detector(machine, settings_of(machine))
+    revolution = RATE_HZ / SPEED_HZ
+    angle = 0.4 + math.tau / revolution * np.arange(round(160 * revolution))
+    samples = channels(positions_of(MACHINE)(angle), angle).astype(np.float32)
+    bad = slice(round(80 * revolution), round(100 * revolution))
+    samples[bad, 0] = 0.5 * np.random.default_rng(1).standard_normal(bad.stop - bad.start)
+    said = said_by(detector, samples)
+    assert {one.quality for one in said if 85 < one.revolutions < 95} == {"not_ok"}
+    assert {one.decision for one in said if one.revolutions > 25} == {"N"}
+
+
 def test_a_shaft_that_a_load_bends_to_the_wall_does_not_rub(calibrated):
     # 83 um below the centre with an orbit of 37 um, in a clearance of 130 um.
     loaded = replace(MACHINE, load=2.2 * MACHINE.load)
