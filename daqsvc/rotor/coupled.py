@@ -118,11 +118,11 @@ def couple(
     w = modes[0].rotor.w
     couplings["forgetting"] = math.exp(-abs(w * duration) / (math.tau * _REACH_REVOLUTIONS))
     for coupling, mode in zip(couplings, modes, strict=True):
-        growth = float(np.linalg.eigvals(state_matrix(mode.rotor, w)).real.max())
-        if growth >= 0.0:
+        grows = growth(mode.rotor, w)
+        if grows >= 0.0:
             raise ValueError(
                 f"rotor bank: in mode {mode.name!r} the whirl grows by itself (by a factor of "
-                f"{math.exp(growth * math.tau / abs(w)):.3g} in a revolution): no machine runs so; give the "
+                f"{math.exp(grows * math.tau / abs(w)):.3g} in a revolution): no machine runs so; give the "
                 "mode more damping or stiffness"
             )
         flow = expm(state_matrix(mode.rotor, w) * duration)
@@ -134,6 +134,11 @@ def couple(
         coupling["precision"] = np.linalg.inv(S)
         coupling["log_norm"] = 0.5 * math.log(np.linalg.det(2.0 * math.pi * S))
     return couplings_at_speed(couplings, observers, modes, w, duration=duration)
+
+
+def growth(rotor: NormalisedRotor, w: float) -> float:
+    """Normalised rate at which the fastest free motion of a rotor grows; negative if all of them die out."""
+    return float(np.linalg.eigvals(state_matrix(rotor, w)).real.max())
 
 
 def couplings_at_speed(

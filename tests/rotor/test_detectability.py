@@ -219,6 +219,15 @@ def test_what_is_no_bank_is_refused(modes, words):
         detectability(modes, noise=0.1, duration=0.1, threshold_nats=16.0)
 
 
+def test_a_fault_that_would_make_the_machine_whirl_by_itself_is_seen_before_that():
+    # Cross stiffness drives whirl, so 60 % of the damping is the least that this machine can run with.
+    driven = {"anisotropy": 0.05, "cross_stiffness": 0.108 * 2.0}
+    n, u = mode("N", **driven), mode("U", e=0.15, **driven)
+    (damping,) = foresee(n, u, snr_db=20.0, faults=("damping_loss",)).smallest
+    assert damping.by_bank is not None
+    assert 0.6 * 0.18 <= damping.by_bank < 0.18
+
+
 def test_rub_without_bounded_motion_is_refused():
     soft = mode("soft", zeta=0.01, contact_stiffness=1e-3, rub=True)
     with pytest.raises(ValueError, match="'soft' the disc leaves its housing"):

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from daqsvc.rotor.coupled import growth
 from daqsvc.rotor.detectability.coupled import CoupledBank, evidence_of
 from daqsvc.rotor.detectability.evidence import (
     Axis,
@@ -150,6 +151,8 @@ VECTOR_THRESHOLD_NATS = 20.0
 _VECTOR_FLOOR = 0.002
 """Part of |1X| that the synchronous vector's baseline is never taken to be better than."""
 _LOG_TOLERANCE = 0.005
+_BEYOND_DOUBT = 1e12
+"""Criterion of a change that nobody misses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -565,9 +568,12 @@ def _of_two_modes(
             return None
 
         def clarity(severity: float) -> float:
+            changed = kind.rotor(rotor, severity)
+            if growth(changed, w) >= 0.0:
+                return _BEYOND_DOUBT  # it whirls by itself, and the more so the worse the fault is
             seen = evidence_of(
                 modes[0],
-                kind.rotor(rotor, severity),
+                changed,
                 noise=noise,
                 duration=duration,
                 variance_factor=variance_factor,
