@@ -79,16 +79,24 @@ class SteadyFit:
         self._turn = self._twice = 0j
         self._moment = np.zeros(3, dtype=np.complex128)
         self.samples = 0
+        self._turns = 0.0
 
-    def add(self, xy: Floats, cos: Floats, sin: Floats) -> None:
+    @property
+    def turns_per_sample(self) -> float:
+        """Mean speed over the samples, in turns of the shaft."""
+        return self._turns / max(1, self.samples)
+
+    def add(self, xy: Floats, cos: Floats, sin: Floats, turns_per_sample: float = math.nan) -> None:
         """Take in a block; a sample with anything that is not finite is left out.
 
         Args:
             xy: float64 ``[n, 2]``, position.
             cos: float64 ``[n]``, cosine of the shaft angle.
             sin: float64 ``[n]``, its sine.
+            turns_per_sample: speed of the shaft, where the mean of it is asked for.
         """
         turn, z = _there(xy, cos, sin)
+        self._turns += len(turn) * turns_per_sample
         self._turn += complex(turn.sum())
         self._twice += complex(np.dot(turn, turn))
         self._moment += (np.vdot(turn, z), np.dot(turn, z), z.sum())

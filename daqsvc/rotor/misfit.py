@@ -53,6 +53,9 @@ _AS_BEFORE = 0.05
 """Part of it within which the machine is as it was."""
 _CERTAIN = 6.0
 """Standard deviations of noise that a change of 1X must have to be one by itself."""
+_OFF_ITS_CURVE = 0.25
+"""Part of the way that 1X goes while the speed hunts, by which it may be off its curve: it follows late, and
+so it did when it was measured."""
 _HUNTING = 1.0 + 0.02 * np.linspace(-1.0, 1.0, 9)
 """Parts of the speed that a healthy machine may turn at: it hunts by 1 % while it is calibrated, and now."""
 _SETTLING_REV, _STEADY_REV = 60, 10
@@ -111,6 +114,12 @@ def hunting(healthy: NormalisedRotor, speed: float) -> Complexes:
         middle.
     """
     return np.array([_motion(healthy, w) for w in (speed * _HUNTING).tolist()])
+
+
+def swing(healthy: NormalisedRotor, slowest: float, fastest: float) -> float:
+    """How far the healthy 1X is at one speed from where it is at another, in clearances."""
+    moved = np.array(_motion(healthy, fastest)) - np.array(_motion(healthy, slowest))
+    return float(np.linalg.norm(moved[:2]))
 
 
 def _motion(rotor: NormalisedRotor, w: float) -> tuple[complex, complex, complex]:
@@ -183,7 +192,7 @@ class SteadyChange:
     samples: int
     variance: Floats | None = None
 
-    def is_certain(self, nearby: Complexes, noise: float) -> bool:
+    def is_certain(self, nearby: Complexes, noise: float, swings: float = 0.0) -> bool:
         """Whether no healthy machine moves so, though the observers may see it as well as the healthy one.
 
         An observer that may err by much follows an orbit that has grown by half, and its innovations hardly
@@ -193,12 +202,14 @@ class SteadyChange:
         Args:
             nearby: complex128 ``[P, 3]``, where the healthy machine moves about this speed; see `hunting`.
             noise: standard deviation of the measured position, in clearances.
+            swings: how far the healthy 1X swings with the speed of late, in clearances; see `swing`.
         """
         healthy = nearby[len(_HUNTING) // 2]
         along = [one[:2] for one in nearby - healthy]
         off = _distance(self.moved[:2], along, beyond=False)
         orbit = float(np.linalg.norm(healthy[:2]))
-        return off > max(_LEAST_CHANGE * orbit, _CERTAIN * noise * math.sqrt(4.0 / self.samples))
+        least = _LEAST_CHANGE * orbit + _OFF_ITS_CURVE * swings
+        return off > max(least, _CERTAIN * noise * math.sqrt(4.0 / self.samples))
 
     def is_over(self, healthy: Complexes) -> bool:
         """Whether 1X is that of the healthy machine again."""

@@ -12,7 +12,7 @@ leaves harmonics, or goes around.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,16 +22,25 @@ from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.misfit import LEAST_REVOLUTIONS, Misfit
 from daqsvc.rotor.synchronous.contact import contact_would_show, has_marks, reaches_wall, whirls_around
 from daqsvc.rotor.synchronous.pulses import rub_pulse
-from daqsvc.rotor.synchronous.signatures import NAMED_BY_RUN_UP, UNMODELLED_NATS, anything, linear_faults
+from daqsvc.rotor.synchronous.signatures import (
+    NAMED_BY_RUN_UP,
+    UNMODELLED_NATS,
+    anything,
+    linear_faults,
+    posterior,
+    unmodelled,
+)
 from daqsvc.rotor.synchronous.vectors import DC, HARMONICS, Healthy
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Mapping, Sequence
+    from collections.abc import Set as AbstractSet
 
     from numpy.typing import NDArray
 
     from daqsvc.rotor.misfit import SteadyChange
     from daqsvc.rotor.model import RotorParameters
+    from daqsvc.rotor.synchronous.signatures import RotorFault
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
@@ -43,6 +52,25 @@ _OFF, _OFF_DC = 0.002, 0.01
 """Parts of the healthy orbit by which components may be off, and the mean position, as probes drift."""
 _MOST_REVOLUTIONS = 128
 """Revolutions after which a change that goes on is judged again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """What explains a steady change, none of it much better than the rest.
+
+    Attributes:
+        faults: those that the bank has a mode of; none if it has no mode for the change.
+        others: those that it has none of, and ``"unmodelled"``; the likeliest first.
+        probabilities: of the others.
+        evidence: of the others over no change, nats.
+        samples: that the change was judged by.
+    """
+
+    faults: frozenset[str]
+    others: tuple[str, ...] = ()
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    samples: int = 0
 
 
 class SteadyFaults:
@@ -85,8 +113,17 @@ class SteadyFaults:
         shifts = (motions - motions[0])[self._faults == "static_load", 2]
         shifts = shifts[np.isfinite(shifts) & (shifts != 0.0)]  # a shaft that may touch and does not has none
         self._load_towards: Complexes = shifts / np.abs(shifts)
-        self._likely: frozenset[str] | None = None
+        self._likely: Explanation | None = None
+        self._held: Explanation | None = None
         self._judged_samples, self._since = 0, 0
+
+    @property
+    def found(self) -> Explanation | None:
+        """What explained the change when it was judged last; None before that.
+
+        An evaluation that shows nothing, as of a change that has become small, does not remove it.
+        """
+        return self._held
 
     def look(self, change: SteadyChange) -> None:
         """Judge a change that goes on: first at once, then as often as its length has doubled.
@@ -97,17 +134,18 @@ class SteadyFaults:
         renewed = change.samples >= 2 * self._judged_samples or change.samples < self._judged_samples
         if (renewed and self._since >= LEAST_REVOLUTIONS) or self._since >= _MOST_REVOLUTIONS:
             self._likely = self.likely(change)
+            self._held = self._likely or self._held
             self._judged_samples, self._since = change.samples, 0
 
     def forget(self) -> None:
         """The change is over."""
-        self._likely, self._judged_samples, self._since = None, 0, LEAST_REVOLUTIONS
+        self._likely = self._held = None
+        self._judged_samples, self._since = 0, LEAST_REVOLUTIONS
 
-    def likely(self, change: SteadyChange) -> frozenset[str] | None:
-        """The faults of the bank that explain a change, none of them much better than the others.
+    def likely(self, change: SteadyChange) -> Explanation | None:
+        """What explains a change.
 
-        None where it has no harmonics to judge by, where none of them explains it, where it is small, and
-        before it is there.
+        None where it has no harmonics to judge by, where it is small, and before it is there.
         """
         if len(change.moved) < len(_ORDER) or not np.isfinite(change.moved).all():
             return None
@@ -119,17 +157,26 @@ class SteadyFaults:
         off = np.full(len(_ORDER), _OFF * healthy.amplitude_um)
         off[DC] = _OFF_DC * healthy.amplitude_um
         variance = scale**2 * (self._variance + of_mean) + off**2
-        free = anything(moved, variance, healthy)
         scores = linear_faults(moved, variance, healthy, load_towards=self._load_towards)
-        scores["rub"] = _rub(moved, variance, healthy, free)
-        known = {name: score for name, score in scores.items() if name in self._names}
-        best = max(known, key=lambda name: known[name])
-        margin = NAMED_BY_RUN_UP.margin_nats
-        # It may also be a fault that the bank has no mode of.
-        other = max(free - UNMODELLED_NATS, *scores.values())
-        if scores["normal"] > known[best] - margin or other > known[best] + margin:
+        scores["rub"] = _rub(moved, variance, healthy)
+        scores["unmodelled"] = unmodelled(moved, variance, healthy)
+        least = max(scores.values()) - NAMED_BY_RUN_UP.margin_nats
+        if scores["normal"] > least:
             return None
-        return frozenset(name for name, score in known.items() if known[best] - score < margin)
+        near: list[RotorFault] = [name for name in scores if scores[name] > least]
+        near.sort(key=lambda name: -scores[name])
+        faults, others = self._names.intersection(near), [name for name in near if name not in self._names]
+        if _ONLY_1X.intersection(others):
+            # The steady motion alone does not tell these two apart for certain.
+            faults |= self._names & _ONLY_1X
+        probabilities = posterior(scores)
+        return Explanation(
+            frozenset(faults),
+            tuple(others),
+            {name: probabilities[name] for name in others},
+            {name: scores[name] - scores["normal"] for name in others},
+            change.samples,
+        )
 
     def predicted(self, change: SteadyChange) -> frozenset[str] | None:
         """The same of a change that the model predicts: all that it may be called if the model is off.
@@ -140,12 +187,14 @@ class SteadyFaults:
         found = self.likely(change)
         if found is None:
             return None
+        names = {*found.faults, *found.others}
         for quarter in range(4):
             off = np.ones(len(_ORDER), dtype=np.complex128)
             turned = MODEL_ERROR * 1j**quarter
             off[:3] += turned, turned.conjugate(), MODEL_ERROR * (-1) ** quarter
-            found |= self.likely(replace(change, moved=off * change.moved)) or frozenset()
-        return found
+            if found := self.likely(replace(change, moved=off * change.moved)):
+                names.update(found.faults, found.others)
+        return frozenset(names)
 
     def narrowed(self, off: Misfit) -> Misfit:
         """What a change excludes and leaves together by the signatures, where they have judged it.
@@ -155,18 +204,18 @@ class SteadyFaults:
         Args:
             off: the same by the modes' own motions.
         """
-        return off if self._likely is None else narrowed(off, self._faults, self._likely)
+        return off if self._likely is None else narrowed(off, self._faults, self._likely.faults)
 
 
-def narrowed(off: Misfit, faults: NDArray[np.str_], likely: Collection[str]) -> Misfit:
+def narrowed(off: Misfit, faults: NDArray[np.str_], likely: AbstractSet[str]) -> Misfit:
     """What is excluded and left together of the modes, if only these faults are likely.
 
     Args:
         off: by the modes' own motions.
         faults: ``[M]``, what each mode is called.
-        likely: of the faults, at least one.
+        likely: of the faults. If there is none, all of them stay together: the change is no mode's.
     """
-    names = set(likely)
+    names = set(likely & set(faults.tolist())) or set(faults.tolist()) - {"normal"}
     pair = names & _ONLY_1X
     if len(pair) == 1 and pair != set(faults[~off.excluded].tolist()) & _ONLY_1X:
         names |= _ONLY_1X & set(faults.tolist())
@@ -177,8 +226,8 @@ def narrowed(off: Misfit, faults: NDArray[np.str_], likely: Collection[str]) -> 
     return replace(off, excluded=~close, pairs=pairs)
 
 
-def _rub(change: Complexes, variance: Floats, healthy: Healthy, free: float) -> float:
-    """Log marginal likelihood of a rub; `free`: of a change of which every component moves by itself.
+def _rub(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    """Log marginal likelihood of a rub.
 
     A rub of a bank is an unbalance that has grown until the shaft touches. So 1X moves by more than the
     wall's push, and where contact is certain, any change may be one.
@@ -187,6 +236,7 @@ def _rub(change: Complexes, variance: Floats, healthy: Healthy, free: float) -> 
     if not reaches_wall(position, healthy):
         return -math.inf
     pulse = rub_pulse(change, variance, healthy, position)
+    free = anything(change, variance, healthy)
     vector, of_vector = change[: len(HARMONICS)], variance[: len(HARMONICS)]
     if has_marks(vector, of_vector) or whirls_around(position, healthy):
         return max(pulse, free + UNMODELLED_NATS)

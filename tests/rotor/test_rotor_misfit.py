@@ -21,6 +21,7 @@ from daqsvc.rotor.misfit import (
     hunting,
     misfit,
     steady_change,
+    swing,
 )
 from daqsvc.rotor.model import NormalisedRotor
 
@@ -307,6 +308,17 @@ def test_a_change_of_a_tenth_of_the_orbit_above_the_noise_is_certain():
     as_large = 0.11 * abs(orbit) / 6.0 / math.sqrt(4.0 / 640)
     assert certain(turned, w, noise=0.97 * as_large)
     assert not certain(turned, w, noise=1.01 * as_large)
+
+
+def test_where_the_speed_hunts_a_machine_may_be_off_its_curve():
+    orbit = RESONANT.orbit(1.0)
+    swings = swing(RESONANT, 0.99, 1.01)
+    assert swings == pytest.approx(abs(RESONANT.orbit(1.01) - RESONANT.orbit(0.99)))
+    change = SteadyChange(np.array([0.2 * orbit, 0.0, 0.0]), samples=640)
+    nearby = hunting(RESONANT, 1.0)
+    assert change.is_certain(nearby, 1e-4)
+    assert not change.is_certain(nearby, 1e-4, swings)
+    assert SteadyChange(2.0 * change.moved, samples=640).is_certain(nearby, 1e-4, swings)
 
 
 def test_which_faults_the_steady_motion_tells_from_healthy():

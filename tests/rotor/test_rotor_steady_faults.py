@@ -13,7 +13,7 @@ from support.two_mode_rotors import UNIT_HZ, Machine, fitted, rubbing, run_up, v
 from daqsvc.rotor.adaptation import SteadyFit, SteadyMotion
 from daqsvc.rotor.misfit import Misfit, SteadyChange, steady_baseline, steady_change
 from daqsvc.rotor.model import RotorParameters
-from daqsvc.rotor.steady_faults import SteadyFaults, narrowed
+from daqsvc.rotor.steady_faults import Explanation, SteadyFaults, narrowed
 from daqsvc.rotor.synchronous.vectors import WITH_THRICE
 
 MACHINE = Machine()
@@ -59,7 +59,12 @@ def judge(baseline, *, modes=MODES, motions=DOWN, parameters=None, speed_hz=SPEE
 
 def likely(after, **known):
     before = vector_of(MACHINE, SPEED_HZ)
-    return judge(before, **known).likely(SteadyChange(motion(after - before), 6400, VARIANCE))
+    return names(judge(before, **known).likely(SteadyChange(motion(after - before), 6400, VARIANCE)))
+
+
+def names(found):
+    """All that explains a change, of the bank or not."""
+    return None if found is None else {*found.faults, *found.others}
 
 
 def rub_vector(machine):
@@ -90,7 +95,7 @@ def test_a_shaft_that_turns_clockwise_is_judged_as_its_mirror(machine, expected)
 
     before, after = (mirrored(vector_of(one, SPEED_HZ)) for one in (MACHINE, machine))
     found = judge(before, parameters=rotor(clockwise=True), speed_hz=-SPEED_HZ)
-    assert found.likely(SteadyChange(motion(after - before), 6400, VARIANCE)) == expected
+    assert names(found.likely(SteadyChange(motion(after - before), 6400, VARIANCE))) == expected
 
 
 def test_a_rub_is_an_orbit_at_the_wall_with_harmonics():
@@ -116,22 +121,34 @@ def test_where_noise_hides_harmonics_an_orbit_at_the_wall_may_rub():
     loud = judge(before).likely(SteadyChange(change, 640, np.full(7, 0.01**2)))
     quiet = judge(before).likely(SteadyChange(change, 640, VARIANCE))
     assert loud is not None
-    assert "rub" in loud
-    assert "rub" not in (quiet or ())
+    assert "rub" in loud.faults
+    assert "rub" not in (names(quiet) or ())
 
 
-def test_only_faults_of_the_bank_are_named():
-    softer, loaded = (vector_of(one, SPEED_HZ) for one in (MACHINE.softened(0.7), LOADED))
+def test_a_fault_that_the_bank_has_no_mode_of_has_its_own_name():
+    before, softer, loaded = (vector_of(one, SPEED_HZ) for one in (MACHINE, MACHINE.softened(0.7), LOADED))
     without = ("normal", "unbalance", "damping_loss", "static_load", "damping_loss", "rub")
-    assert likely(softer, modes=without) is None
+    found = judge(before, modes=without).likely(SteadyChange(motion(softer - before), 6400, VARIANCE))
+    assert found is not None
+    assert (found.faults, found.others) == (frozenset(), ("stiffness_loss",))
+    assert found.probabilities["stiffness_loss"] > 0.9
+    assert found.evidence["stiffness_loss"] > 20.0
     assert likely(loaded, modes=without) == {"static_load"}
+
+
+def test_of_unbalance_and_damping_that_with_a_mode_stays_beside_the_other():
+    before, damped = (vector_of(one, SPEED_HZ) for one in (MACHINE, MACHINE.damped(0.5)))
+    without = ("normal", "unbalance", "unbalance", "static_load", "stiffness_loss", "rub")
+    found = judge(before, modes=without).likely(SteadyChange(motion(damped - before), 6400, VARIANCE))
+    assert found is not None
+    assert (found.faults, found.others) == (frozenset({"unbalance"}), ("damping_loss",))
 
 
 def test_a_load_from_where_it_is_expected_is_told_from_a_softer_support_in_more_noise():
     before, after = (vector_of(one, SPEED_HZ) for one in (MACHINE, LOADED))
     loud = SteadyChange(motion(after - before), 640, np.full(7, 0.04**2))
-    assert judge(before, motions=NO_MOTIONS).likely(loud) == {"static_load", "stiffness_loss"}
-    assert judge(before, motions=DOWN).likely(loud) == {"static_load"}
+    assert names(judge(before, motions=NO_MOTIONS).likely(loud)) == {"static_load", "stiffness_loss"}
+    assert names(judge(before, motions=DOWN).likely(loud)) == {"static_load"}
     # From aside it is a load still.
     assert likely(vector_of(replace(MACHINE, load=MACHINE.load + 16), SPEED_HZ)) == {"static_load"}
 
@@ -142,11 +159,11 @@ def test_a_mode_that_has_no_steady_motion_tells_no_direction_of_a_load():
     assert likely(loaded, modes=(*MODES, "static_load"), motions=both) == {"static_load"}
 
 
-def test_what_no_fault_explains_is_left_to_the_modes():
+def test_what_no_fault_explains_is_unmodelled():
     strange = vector_of(MACHINE, SPEED_HZ)
     strange[2] += 12.0
     strange[3:5] += (6.0, -4.0j)
-    assert likely(strange) is None
+    assert likely(strange) == {"unmodelled"}
 
 
 def test_before_there_is_a_change_nothing_is_excluded_by_it():
@@ -160,7 +177,7 @@ def test_a_small_change_gets_no_name_however_clear_it_is(part, expected):
     grown = replace(MACHINE, eccentricity_um=part * MACHINE.eccentricity_um)
     before, after = (vector_of(one, SPEED_HZ) for one in (MACHINE, grown))
     clear = SteadyChange(motion(after - before), 10**6, 1e-4 * VARIANCE)
-    assert judge(before).likely(clear) == expected
+    assert names(judge(before).likely(clear)) == expected
 
 
 def test_without_harmonics_nothing_is_judged():
@@ -191,6 +208,13 @@ def test_what_is_not_likely_is_excluded_and_what_is_stays_together():
     assert not alone.pairs.any()
 
 
+def test_where_no_mode_explains_the_change_the_faults_stay_together_and_healthy_is_excluded():
+    found = narrowed(off("static_load"), np.array(MODES), set())
+    assert (found.excluded == flags("normal")).all()
+    assert found.pairs[1:, 1:].sum() == 5 * 4
+    assert not found.pairs[0].any()
+
+
 def test_unbalance_and_damping_are_told_apart_where_the_modes_agree():
     faults, others = np.array(MODES), ("normal", "static_load", "stiffness_loss", "rub")
     agreed = narrowed(off(*others, "damping_loss"), faults, {"unbalance"})
@@ -203,9 +227,9 @@ def test_unbalance_and_damping_are_told_apart_where_the_modes_agree():
 
 def test_a_change_that_goes_on_is_judged_each_time_it_has_doubled(monkeypatch):
     before = vector_of(MACHINE, SPEED_HZ)
-    found, judged = judge(before), []
+    found, judged, explained = judge(before), [], Explanation(frozenset({"unbalance"}), ("unmodelled",))
     monkeypatch.setattr(
-        SteadyFaults, "likely", lambda self, change: judged.append(change.samples) or frozenset({"unbalance"})
+        SteadyFaults, "likely", lambda self, change: judged.append(change.samples) or explained
     )
     found.forget()
     for revolutions in range(8, 300):
@@ -217,7 +241,14 @@ def test_a_change_that_goes_on_is_judged_each_time_it_has_doubled(monkeypatch):
     assert judged[6:] == [64 * 8, 64 * 16]
     assert not narrowed(off(), np.array(MODES), {"unbalance"}).excluded[1]
     assert found.narrowed(off()).excluded[3]
+    # An evaluation that shows nothing, as on the way back, excludes no mode and removes no name.
+    monkeypatch.setattr(SteadyFaults, "likely", lambda *_: None)
+    for revolutions in range(8, 17):
+        found.look(SteadyChange(np.zeros(7), 64 * revolutions))
+    assert not found.narrowed(off()).excluded.any()
+    assert found.found is explained
     found.forget()
+    assert found.found is None
     assert not found.narrowed(off()).excluded.any()
 
 
@@ -289,5 +320,5 @@ def test_what_is_predicted_allows_for_the_error_of_the_model():
     before = vector_of(MACHINE, SPEED_HZ)
     grown = vector_of(replace(MACHINE, eccentricity_um=1.15 * MACHINE.eccentricity_um), SPEED_HZ)
     change = SteadyChange(motion(grown - before), 6400, 17.0 * VARIANCE)
-    assert judge(before).likely(change) == {"unbalance"}
+    assert names(judge(before).likely(change)) == {"unbalance"}
     assert judge(before).predicted(change) == {"unbalance", "damping_loss"}

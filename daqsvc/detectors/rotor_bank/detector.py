@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,8 +35,9 @@ from daqsvc.rotor.misfit import (
     misfit,
     steady_baseline,
     steady_change,
+    swing,
 )
-from daqsvc.rotor.steady_faults import SteadyFaults, narrowed
+from daqsvc.rotor.steady_faults import Explanation, SteadyFaults, narrowed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -59,10 +62,34 @@ _SAME_SPEED = 0.02
 """Relative difference from the speed of the calibration up to which its motion is the healthy one."""
 _FEW_REVOLUTIONS = 32
 """Whose steady motion shows whether a machine that the observers take for healthy has changed."""
+_HUNTING_REVOLUTIONS = 256
+"""Over which the speed is seen to hunt."""
 _PREDICTED_REVOLUTIONS = 100.0
 """Over which a steady motion is predicted: a change is there for as long, or longer."""
 _BLIND_REVOLUTIONS = 3.0
 """Time for which the angle is trusted without an edge."""
+
+
+@dataclass(slots=True)
+class _Change:
+    """What is known of a change of the machine.
+
+    Attributes:
+        departed: whether it has been stated that the machine has left the declared mode.
+        left_index: first sample of it; None while the machine is healthy.
+        off: how the modes miss its steady motion; None while none was compared.
+        besides: what else than the modes explains it; None where nothing does.
+    """
+
+    departed: bool = False
+    left_index: int | None = None
+    off: Misfit | None = None
+    besides: Explanation | None = None
+
+    @property
+    def no_mode_explains_it(self) -> bool:
+        """Whether it is none of the modes: then which of them is nearest means nothing."""
+        return self.besides is not None and not self.besides.faults
 
 
 class RotorBankDetector:
@@ -86,6 +113,10 @@ class RotorBankDetector:
     AC-coupled, or a revolution has fewer than 16 samples. Then, and where no fault explains the change, it is
     compared with where each mode takes the machine (`daqsvc.rotor.misfit`). What is too far from it is left
     out; what is not told apart by more than the model's own error is one group.
+
+    The signatures also know faults that the bank has no mode of, and changes that no fault explains. These
+    are in the group then by their own names, as ``stiffness_loss`` or ``unmodelled``. Where they explain the
+    change much better than any mode, they are the decision. The nearest mode would be a wrong name.
 
     A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
     guess, the observers start again. While the quality is not good there is no evidence, and the decision is
@@ -169,17 +200,18 @@ class RotorBankDetector:
             ac_coupled=ac_coupled,
         )
         self._clearance_um = rotor.clearance_um
+        self._judge = RevolutionJudge(probes, missing=OBSERVED_SHARE, pooled=1)
+        self._exact = set() if rotor.on_film else {"static_load"}
+        self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
         self._stater = BankDiagnosisBuilder(
             machine=machine,
             detector=name,
             stream=stream,
             sensors=(probes[0].name, probes[1].name, keyphasor.name),
             modes=self._modes,
+            faults=tuple(self._faults.values()),
             rules=self._rules,
         )
-        self._judge = RevolutionJudge(probes, missing=OBSERVED_SHARE, pooled=1)
-        self._exact = set() if rotor.on_film else {"static_load"}
-        self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
         # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
         self._noise = noise_um / rotor.clearance_um / abs(spread)
         self._bank = self._new_bank()
@@ -205,14 +237,14 @@ class RotorBankDetector:
             )
         self._calibrate_revolutions = calibrate_revolutions
         self._calibration = SteadyFit() if calibrate_revolutions else None
-        self._departed = False
         self._calibrated_speed = math.nan
         self._steady_motions = SteadyMotions(self._duration)
         judged = not ac_coupled and all(is_one_fault(mode, rotor) for mode in self._modes[1:])
         self._two_mode_rotor = rotor if judged and rotor.two_modes is not None else None
         self._steady_faults: SteadyFaults | None = None
+        self._change = _Change()
+        self._speeds: deque[float] = deque(maxlen=_HUNTING_REVOLUTIONS)
         self._harmonics: Complexes = np.zeros(4, dtype=np.complex128)
-        self._misfit = math.nan
         self._last_revolution = np.empty((0, 3))
         self._next_index: int | None = None
         self._revolutions = 0.0
@@ -223,6 +255,11 @@ class RotorBankDetector:
     def faults(self) -> Mapping[str, str]:
         """What each mode is in the words of a verdict, by name: ``"normal"``, ``"unbalance"``, ..."""
         return self._faults
+
+    @property
+    def knows_other_faults(self) -> bool:
+        """Whether it also knows faults that it has no mode of, and changes that no fault explains."""
+        return self._steady_faults is not None
 
     @property
     def bank_modes(self) -> tuple[BankMode, ...]:
@@ -308,7 +345,8 @@ class RotorBankDetector:
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
         index = self._next_index or 0
-        return [self._stater.silence(silence_s, self._decision, index, t_ns, self._revolutions)]
+        severity = self._stater.severity(self._bank.decision, self._change.besides)
+        return [self._stater.silence(silence_s, self._decision, severity, index, t_ns, self._revolutions)]
 
     @property
     def _columns(self) -> list[int]:
@@ -356,10 +394,14 @@ class RotorBankDetector:
             diagnosis = self._changes(report, verdict, first_index, len(samples), before, t_ns, period_ns)
             diagnosis += self._departures(report, verdict, end_index, t_ns, period_ns)
         if math.floor(self._revolutions) > math.floor(before):
+            self._speeds.append(self._bank.speed)
             self._compare_steady(report)
             began, self._progress_index = self._progress_index, end_index
+            changed = self._take_besides()
+            if changed:
+                began = self._onset(end_index)
             diagnosis.append(
-                self._diagnosis(report, verdict, began, end_index, t_ns, self._bank.decision, changed=False)
+                self._diagnosis(report, verdict, began, end_index, t_ns, self._bank.decision, changed=changed)
             )
         return diagnosis
 
@@ -377,10 +419,16 @@ class RotorBankDetector:
         changes = []
         after = self._revolutions
         for change in report.declarations:
+            onset = first_index + min(change.onset, change.sample)
+            if change.mode == 0:
+                self._change.besides, self._change.left_index = None, None
+            elif self._change.left_index is None:
+                self._change.left_index = onset
+            if self._change.no_mode_explains_it:
+                continue
             self._decision = self._modes[change.mode].name
             self._revolutions = before + (change.sample + 1) / self._tracker.period_samples
             at_ns = t_ns - round((n - 1 - change.sample) * period_ns)
-            onset = first_index + min(change.onset, change.sample)
             end = first_index + change.sample + 1
             changes.append(self._diagnosis(report, verdict, onset, end, at_ns, change.mode, changed=True))
         self._revolutions = after
@@ -390,15 +438,45 @@ class RotorBankDetector:
         self, report: BankReport, verdict: RevolutionQuality, end_index: int, t_ns: int, period_ns: float
     ) -> list[Diagnosis]:
         """The statement that the machine has left the declared mode, once."""
-        departure, departed = report.departure, self._departed
-        self._departed = departure is not None
+        departure, departed = report.departure, self._change.departed
+        self._change.departed = departure is not None
+        if departure is None and report.decision == 0:
+            self._change.left_index = None
         if departure is None or departed:
             return []
         at_ns = t_ns + round(departure.sample * period_ns)
-        onset, end = end_index - 1 + departure.onset, end_index + departure.sample
-        return [
-            self._diagnosis(report, verdict, min(onset, end - 1), end, at_ns, report.decision, changed=False)
-        ]
+        end = end_index + departure.sample
+        onset = min(end_index - 1 + departure.onset, end - 1)
+        if self._change.left_index is None:
+            self._change.left_index = onset
+        if self._change.no_mode_explains_it:
+            return []
+        return [self._diagnosis(report, verdict, onset, end, at_ns, report.decision, changed=False)]
+
+    def _onset(self, end_index: int) -> int:
+        """Since when the machine is not healthy: by the observers, or by what was judged."""
+        known, besides = self._change.left_index, self._change.besides
+        if known is None:
+            known = self._change.left_index = end_index - (1 if besides is None else besides.samples)
+        return min(known, end_index - 1)
+
+    def _take_besides(self) -> bool:
+        """Take in what else than the modes explains the change; whether another decision or group is stated.
+
+        Where no mode explains it, that is the decision: which mode is nearest means nothing.
+        """
+        found = None if self._steady_faults is None else self._steady_faults.found
+        mode = self._bank.decision
+        seen = found is not None and bool(found.others) and (mode != 0 or not found.faults)
+        before, now = self._change.besides, found if seen else None
+        self._change.besides = now
+        stated = self._decision
+        if now is not None and not now.faults:
+            self._decision = now.others[0]
+        elif stated not in self._faults and mode != UNDETERMINED:
+            self._decision = self._modes[mode].name
+        others = [set() if one is None else set(one.others) for one in (before, now)]
+        return self._decision != stated or others[0] != others[1]
 
     def _compare_steady(self, report: BankReport) -> None:
         """Leave out the modes that the steady motion is too far from, also the healthy one."""
@@ -409,9 +487,14 @@ class RotorBankDetector:
         healthy = np.concatenate((nearby[len(nearby) // 2], self._harmonics))
         motions, changed = self._watch.sound_motions, bank.decision != 0 or report.departure is not None
         change = steady_change(motions if changed else motions[-_FEW_REVOLUTIONS:], healthy, self._noise)
-        certain = change is not None and self._at_calibrated_speed and change.is_certain(nearby, self._noise)
+        swings = swing(self._bank_modes[0].rotor, min(self._speeds), max(self._speeds))
+        certain = (
+            change is not None
+            and self._at_calibrated_speed
+            and change.is_certain(nearby, self._noise, swings)
+        )
         if not (changed or certain):
-            self._misfit = math.nan
+            self._change.off = None
             bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
             if self._steady_faults is not None:
                 self._steady_faults.forget()
@@ -422,6 +505,7 @@ class RotorBankDetector:
         if healthy_like[bank.decision] and change.is_over(healthy):
             # The observers would never go back to healthy from a mode that looks like it.
             healthy_like[0] = False
+            self._change.off = None
             bank.exclude(healthy_like, np.zeros((count, count), dtype=np.bool_))
             return
         off = self._compared(change, self._steady_motions.of(bank.observers, bank.couplings))
@@ -430,7 +514,7 @@ class RotorBankDetector:
             off = self._steady_faults.narrowed(off)
         off.excluded[0] |= certain
         bank.exclude(off.excluded, off.pairs)
-        self._misfit = float(off.part[bank.decision])
+        self._change.off = off
 
     def _compared(self, change: SteadyChange, motions: Complexes) -> Misfit:
         """A steady change beside where each mode takes the machine."""
@@ -469,10 +553,12 @@ class RotorBankDetector:
             likely = None if steady_faults is None else steady_faults.predicted(change)
             if likely is not None:
                 off = narrowed(off, faults, likely)
+            others = [] if likely is None else sorted(likely.difference(faults.tolist()))
             # No steady motion is compared of a machine that all observers take for the healthy one.
             off.excluded[0] = change.is_certain(nearby, self._noise)
             together = off.pairs[k] | (bank.look_alike(k) & ~off.excluded)
-            predicted[self._modes[k].name] = tuple(dict.fromkeys(map(str, [faults[k], *faults[together]])))
+            names = [faults[k], *faults[together], *others]
+            predicted[self._modes[k].name] = tuple(dict.fromkeys(map(str, names)))
         return predicted
 
     @property
@@ -485,11 +571,12 @@ class RotorBankDetector:
     ) -> list[Diagnosis]:
         """Measure the healthy motion; at the end, put it into every mode and report it."""
         assert self._calibration is not None  # noqa: S101 - the caller asks while there is one
-        self._calibration.add(xy, cos, sin)
+        self._calibration.add(xy, cos, sin, 1.0 / self._tracker.period_samples)
         if self._calibration.samples < self._calibrate_revolutions * self._tracker.period_samples:
             return []
         motion = self._calibration.solve()
-        speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
+        # A speed that hunts is another at every moment; the motion is that of the mean.
+        speed = self._direction * math.tau * self._calibration.turns_per_sample / self._duration
         self._bank_modes, self._calibrated_speed = adapted(self._bank_modes, motion, speed), speed
         self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
         self._steady_motions = SteadyMotions(self._duration)
@@ -575,7 +662,8 @@ class RotorBankDetector:
             decision=decision,
             stated=self._decision,
             changed=changed,
-            misfit=self._misfit,
+            off=self._change.off,
+            besides=self._change.besides,
             missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
         )
 

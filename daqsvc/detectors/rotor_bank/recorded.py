@@ -12,6 +12,7 @@ from daqsvc.detectors.rotor_bank.settings import RotorBank
 from daqsvc.detectors.shaft.verdict import Instant, ModeStep, RotorVerdict
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, statements_of
 from daqsvc.dsp.quality.recorded import complaints, known_against
+from daqsvc.rotor.synchronous.signatures import FAULTS
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -53,7 +54,9 @@ class RecordedBank(RecordedDetector[RotorBank]):
         (statements,) = statements_of(detector, recorded)
         return Evaluated(
             (statements,),
-            bank_verdict(recorded.recording, statements, detector.faults),
+            bank_verdict(
+                recorded.recording, statements, detector.faults, closed=not detector.knows_other_faults
+            ),
             partial(_draw, recorded.recording, statements, tuple(detector.faults)),
         )
 
@@ -64,7 +67,9 @@ def _draw(recording: Recording, statements: Statements, modes: tuple[str, ...], 
     draw_bank(recording, statements, modes, f"{prefix}-bank")
 
 
-def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[str, str]) -> RotorVerdict:
+def bank_verdict(
+    recording: Recording, statements: Statements, faults: Mapping[str, str], *, closed: bool
+) -> RotorVerdict:
     """What a recording reports about a rotor by its bank alone.
 
     Modes become the faults that they represent; levels of one fault are one verdict.
@@ -73,6 +78,7 @@ def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[s
         recording: the recording.
         statements: all that the bank stated.
         faults: the fault that each mode represents.
+        closed: whether the bank knows its modes and nothing else.
     """
     quality = known_against(recording)
     source = str(recording.source)
@@ -99,14 +105,14 @@ def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[s
     for mode, probability in last.probabilities.items():
         chances[cast("RotorFault", faults.get(mode, mode))] += probability
     changed = group[0] != "normal" and departed is not None
-    if changed:
+    if changed and closed:
         quality = quality.with_problem(_CLOSED_LIST)
     return RotorVerdict(
         recording=source,
         quality=quality,
         verdict=group[0],
         group=group,
-        named=last.decision in faults,
+        named=_fault(last.decision, faults) is not None,
         probabilities=chances,
         evidence=cast("dict[RotorFault, float]", dict(last.evidence)),
         onset=_instant(onset, recording.rate_hz, last) if changed and onset is not None else None,
@@ -121,8 +127,13 @@ def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[s
 
 def _faults(diagnosis: Diagnosis, faults: Mapping[str, str]) -> tuple[RotorFault, ...]:
     """The faults that a statement leaves, the decision first."""
-    modes = [mode for mode in (diagnosis.decision, *diagnosis.group) if mode in faults]
-    return tuple(dict.fromkeys(cast("RotorFault", faults[mode]) for mode in modes))
+    named = [_fault(name, faults) for name in (diagnosis.decision, *diagnosis.group)]
+    return tuple(dict.fromkeys(fault for fault in named if fault is not None))
+
+
+def _fault(name: str, faults: Mapping[str, str]) -> RotorFault | None:
+    """The fault of a mode, or one that the bank has no mode of; None while there is no name."""
+    return cast("RotorFault | None", faults.get(name, name if name in FAULTS else None))
 
 
 def _history(
@@ -136,7 +147,7 @@ def _history(
         group = _faults(diagnosis, faults)
         if not group:
             continue
-        settled = diagnosis.decision in faults
+        settled = _fault(diagnosis.decision, faults) is not None
         if group == ("normal",):
             departed = named = onset = None
         elif departed is None:

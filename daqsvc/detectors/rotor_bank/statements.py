@@ -12,7 +12,7 @@ from daqsvc.diagnosis.record import Diagnosis, Severity, silence_reason
 from daqsvc.rotor.bank import UNDETERMINED
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from daqsvc.dsp.quality.probes import RevolutionQuality
     from daqsvc.rotor.bank import BankReport
     from daqsvc.rotor.decision import DecisionRules
+    from daqsvc.rotor.misfit import Misfit
+    from daqsvc.rotor.steady_faults import Explanation
 
+    Flags = NDArray[np.bool_]
     Floats = NDArray[np.float64]
 
 MODEL = "laval-rotor-rub/1"
@@ -29,6 +32,7 @@ DEPARTURE = "departure"
 """Decision while the machine has left the declared mode and the cause is not yet known."""
 
 UNDETERMINED_DECISION = "undetermined"
+_LEAST_PROBABILITY = 1e-300
 _SEVERITIES: tuple[Severity, ...] = ("normal", "alert", "danger")
 
 
@@ -61,6 +65,7 @@ class BankDiagnosisBuilder:
         stream: name of the stream.
         sensors: names of the sensors.
         modes: the modes, healthiest first.
+        faults: what each mode is called.
         rules: thresholds and the rule that declares.
     """
 
@@ -69,6 +74,7 @@ class BankDiagnosisBuilder:
     stream: str
     sensors: tuple[str, ...]
     modes: tuple[RotorMode, ...]
+    faults: tuple[str, ...]
     rules: DecisionRules
 
     def state(
@@ -80,7 +86,8 @@ class BankDiagnosisBuilder:
         decision: int,
         stated: str,
         changed: bool,
-        misfit: float,
+        off: Misfit | None,
+        besides: Explanation | None,
         missing_share: float,
     ) -> Diagnosis:
         """A diagnosis.
@@ -92,7 +99,8 @@ class BankDiagnosisBuilder:
             decision: index of the declared mode, -1 while undetermined.
             stated: its name, as it was last stated.
             changed: whether this states a change.
-            misfit: part of the steady change that the declared mode does not explain; NaN if not known.
+            off: how the modes miss the steady change; None where none was compared.
+            besides: what else than the modes explains it; None where nothing does.
             missing_share: share of the samples of the last revolution that are missing.
         """
         names = [mode.name for mode in self.modes]
@@ -101,15 +109,26 @@ class BankDiagnosisBuilder:
         evidence: dict[str, float] = {}
         if decision != UNDETERMINED and self.rules.rule == "cusum":
             probabilities, evidence = _odds_and_evidence(report, names)
-        group, severity = report.group, self.severity(decision)
-        if departure is not None and not changed:
-            group, stated = departure.candidates, DEPARTURE
-            mildest = min(_SEVERITIES.index(self.severity(i)) for i in group)
+        if off is not None and decision != UNDETERMINED:
+            probabilities = self._shared(probabilities, decision, off.pairs[decision])
+        chances = dict(zip(names, probabilities.tolist(), strict=True))
+        indices, severity = report.group, self.severity(decision, besides)
+        if besides is not None and not besides.faults:
+            # The evidence of the modes is one for the nearest of them, not for what is stated.
+            indices, evidence = (), dict(besides.evidence)
+        elif departure is not None and not changed:
+            indices, stated = departure.candidates, DEPARTURE
+            mildest = min(_SEVERITIES.index(self.severity(i)) for i in indices)
             severity = _SEVERITIES[max(mildest, _SEVERITIES.index(severity))]
+        group = tuple(names[i] for i in indices)
+        if besides is not None:
+            chances = _with_others(chances, besides)
+            group = tuple(dict.fromkeys((*(group or (stated,)), *besides.others)))
+            group = group if len(group) > 1 else ()
         statistics = {"speed": moment.speed_rpm}
         statistics |= {f"paper.{name}": float(p) for name, p in zip(names, paper, strict=True)}
-        if not math.isnan(misfit):
-            statistics["misfit"] = misfit
+        if off is not None and not math.isnan(missed := float(off.part[decision])):
+            statistics["misfit"] = missed
         return Diagnosis(
             machine=self.machine,
             detector=self.detector,
@@ -120,8 +139,8 @@ class BankDiagnosisBuilder:
             decision=stated,
             changed=changed,
             severity=severity,
-            probabilities=dict(zip(names, probabilities.tolist(), strict=True)),
-            group=tuple(names[i] for i in group),
+            probabilities=chances,
+            group=group,
             statistics=statistics,
             units={"speed": "rpm"},
             thresholds={
@@ -138,17 +157,25 @@ class BankDiagnosisBuilder:
             missing_share=missing_share,
         )
 
-    def silence(self, silence_s: float, stated: str, index: int, t_ns: int, revolutions: float) -> Diagnosis:
+    def silence(
+        self,
+        silence_s: float,
+        stated: str,
+        severity: Severity,
+        index: int,
+        t_ns: int,
+        revolutions: float,
+    ) -> Diagnosis:
         """That there are no samples.
 
         Args:
             silence_s: for how long.
             stated: the decision that is held.
+            severity: of it.
             index: the sample that would be next.
             t_ns: now.
             revolutions: of the shaft until the last sample.
         """
-        names = [mode.name for mode in self.modes]
         return Diagnosis(
             machine=self.machine,
             detector=self.detector,
@@ -157,7 +184,7 @@ class BankDiagnosisBuilder:
             first_index=index,
             end_index=index,
             decision=stated,
-            severity=self.severity(names.index(stated) if stated in names else UNDETERMINED),
+            severity=severity,
             revolutions=revolutions,
             quality="missing",
             reason=silence_reason(self.stream, silence_s),
@@ -165,10 +192,36 @@ class BankDiagnosisBuilder:
             model=MODEL,
         )
 
-    def severity(self, mode: int) -> Severity:
-        """How bad a declared mode is; the paper's rule raises no alarm."""
+    def _shared(self, probabilities: Floats, decision: int, together: Flags) -> Floats:
+        """Equal parts for the faults that are not told apart: what favours one is the model's error."""
+        if not together.any():
+            return probabilities
+        faults = np.array(self.faults)
+        alike = together | (faults == faults[decision])
+        names = dict.fromkeys(faults[alike].tolist())
+        shared = probabilities.copy()
+        for name in names:
+            levels = alike & (faults == name)
+            odds = np.where(levels, np.maximum(probabilities, _LEAST_PROBABILITY), 0.0)
+            shared[levels] = (odds / odds.sum())[levels] * probabilities[alike].sum() / len(names)
+        return shared
+
+    def severity(self, mode: int, besides: Explanation | None = None) -> Severity:
+        """How bad a declared mode is; the paper's rule raises no alarm.
+
+        A change that no mode explains is as bad as the nearest of them, and at least an alert.
+        """
         known = mode != UNDETERMINED and self.rules.rule == "cusum"
-        return self.modes[mode].severity if known else "normal"
+        severity = self.modes[mode].severity if known else "normal"
+        outside = besides is not None and not besides.faults
+        return "alert" if outside and severity == "normal" else severity
+
+
+def _with_others(modes: Mapping[str, float], besides: Explanation) -> dict[str, float]:
+    """The probabilities of the modes with those of what else explains the change; they sum to one."""
+    others = besides.probabilities
+    left = 1.0 - sum(others.values())
+    return {**{name: left * p for name, p in modes.items()}, **others}
 
 
 def _odds_and_evidence(report: BankReport, names: Sequence[str]) -> tuple[Floats, dict[str, float]]:

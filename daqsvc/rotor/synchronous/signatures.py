@@ -128,11 +128,7 @@ def likelihoods(
     """
     scores = linear_faults(change, variance, healthy)
     normal = scores["normal"]
-    scores["unmodelled"] = float(
-        np.logaddexp(
-            anything(change, variance, healthy) - UNMODELLED_NATS, crack(change, variance, healthy) - 1.0
-        )
-    )
+    scores["unmodelled"] = unmodelled(change, variance, healthy)
     scores["rub"], behind = _rub(change, variance, healthy, position, shaken=shaken)
     if behind:
         scores["rub"] = min(scores["rub"], max(scores[name] for name in scores.keys() - {"rub"}) - behind)
@@ -160,6 +156,18 @@ def linear_faults(
         "static_load": _static_load(change, variance, healthy, load_towards),
         "stiffness_loss": _stiffness_loss(change, variance, healthy),
     }
+
+
+def unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    """Log marginal likelihood of a change that no fault explains, or a crack alone, in nats.
+
+    Args:
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, um.
+        variance: float64, as many, um^2.
+        healthy: the machine before.
+    """
+    free = anything(change, variance, healthy) - UNMODELLED_NATS
+    return float(np.logaddexp(free, crack(change, variance, healthy) - 1.0))
 
 
 def damping_misfit(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -535,7 +543,7 @@ def identify(
     # The typical component: that of the mean position may be drift of the probes, or not there at all.
     deviation = math.sqrt(float(np.median(variance)))
     best = max(scores, key=lambda name: scores[name])
-    probabilities = _posterior(scores)
+    probabilities = posterior(scores)
     candidates: tuple[RotorFault, ...]
     if best != "normal" and size < rules.least_severity * amplitude + 2.0 * deviation:
         candidates = ("small_change",)
@@ -597,7 +605,7 @@ def _group(
     return tuple(sorted(close, key=lambda name: -scores[name]))
 
 
-def _posterior(scores: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
+def posterior(scores: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
     """Probabilities of hypotheses that are equally likely before, by tempered likelihoods."""
     top = max(scores.values())
     weights = {name: math.exp((score - top) / TEMPERATURE) for name, score in scores.items()}
