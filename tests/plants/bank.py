@@ -235,7 +235,7 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
         fault=fault,
         snr_db=snr_db,
         false_alarms=alarms,
-        fault_said=end.decision.rsplit(" ", 1)[0] if " " in end.decision else "",
+        fault_said="" if end.decision in {"undetermined", "departure"} else end.decision.rsplit(" ", 1)[0],
         group=tuple(name for name in group if name not in {"undetermined", "departure"}),
         delay=delay,
         told_delay=_told_delay(detector, z, angle, fault),
