@@ -96,6 +96,16 @@ def _static_load(b: Bench, size: float) -> Stage:
     return b.stage(ONSET_REV, b.machine(load_weight=size * b.whirl_m / float(moved)))
 
 
+def _load_aside(b: Bench, size: float) -> Stage:
+    # Gears and belts load from where they are: any direction, by lot.
+    name = f"{b.geometry.name} {b.of_critical} {size}"
+    angle = np.random.default_rng(zlib.crc32(name.encode())).uniform(-math.pi, math.pi)
+    one = b.machine(load_weight=1.0, load_angle_rad=angle)
+    moved = (one.rest - b.healthy.rest) @ np.stack([b.healthy.places[p] for p in ("probe x", "probe y")]).T
+    part = size * b.whirl_m / float(np.linalg.norm(moved))
+    return b.stage(ONSET_REV, b.machine(load_weight=part, load_angle_rad=angle))
+
+
 def _rub(b: Bench, size: float) -> Stage:
     modal = (sum(b.healthy.disc_masses_kg) + 0.3 * b.healthy.weight_n / 9.80665) * b.critical[0] ** 2
     contact = Contact(
@@ -112,6 +122,7 @@ FAULTS: dict[str, tuple[Callable[[Bench, float], Stage], tuple[float, ...]]] = {
     "damping_loss": (_damping_loss, (0.65, 0.45)),
     "stiffness_loss": (_stiffness_loss, (0.65, 0.45)),
     "static_load": (_static_load, (0.5, 1.0)),
+    "static_load aside": (_load_aside, (0.5, 1.0)),
     "rub": (_rub, (4.5, 5.5)),
 }
 
@@ -132,7 +143,8 @@ def _kept(folder: Path, b: Bench, fault: str, size: float, stages: list[Stage]) 
         rate_hz=motion.rate_hz,
     )
     return BankCase(
-        name, b.geometry.name, b.geometry.part, b.speed_rad_s * 30.0 / math.pi, b.of_critical, fault, size,
+        name, b.geometry.name, b.geometry.part, b.speed_rad_s * 30.0 / math.pi, b.of_critical,
+        fault.partition(" ")[0], size,
         1e6 * b.whirl_m, 1e6 * (abs(b.rest_probe) + CLEARANCE * b.whirl_m), b.critical[0] / (2.0 * math.pi),
         b.critical[1],
     )  # fmt: skip

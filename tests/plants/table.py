@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from plants.bank import bank_answers, bank_scored, bank_summary
+from plants.bank import bank_answers, bank_beside, bank_scored, bank_summary, parts_of
 from plants.diagram import draw
 from plants.score import CLEAR, MODELLED, ONLY_1X, SNR_DB, TRUTH, Said, scored
 
@@ -107,8 +107,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the noise, and of what is stated wrongly")
     options = parser.parse_args(arguments)
     part, seed = options.part, options.seed
-    bank = bank_scored(options.folder, part=part, seed=seed)
+    bank, others, without = parts_of(bank_scored(options.folder, part=part, seed=seed))
     _put(f"bank, {part}", [bank_summary(bank), *(bank_answers(bank, snr) for snr in SNR_DB)], seed)
+    _put(f"bank beside, {part}", [bank_beside(others, without)], seed)
     names = {}
     for run_up, place in ((False, part), (True, f"{part}, run-up")):
         said = scored(options.folder, part=part, seed=seed, run_up=run_up)
