@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.detectors.rotor_bank.detector import RotorBankDetector, RotorMode
-from daqsvc.detectors.rotor_bank.modes import fault_of
+from daqsvc.detectors.rotor_bank.modes import fault_of, named_besides
 from daqsvc.detectors.shaft.build import keyphasor, probes
 from daqsvc.rotor.calibration.file import CalibrationFileError, load_record
 from daqsvc.rotor.decision import DecisionRules
@@ -70,6 +70,17 @@ def faults(machine: MachineFile, bank: RotorBank) -> dict[str, str]:
     """
     rotor = healthy_rotor(machine, bank)
     return {mode.name: fault_of(mode, rotor) for mode in rotor_modes(machine, bank, rotor)}
+
+
+def besides(machine: MachineFile, bank: RotorBank) -> tuple[str, ...]:
+    """What the bank names besides its modes.
+
+    Args:
+        machine: the machine file.
+        bank: its rotor bank.
+    """
+    rotor = healthy_rotor(machine, bank)
+    return named_besides(rotor_modes(machine, bank, rotor), rotor, ac_coupled=machine.ac_coupled)
 
 
 def healthy_rotor(machine: MachineFile, bank: RotorBank) -> RotorParameters:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes, fault_of, is_one_fault
+from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes, fault_of, named_besides
 from daqsvc.detectors.rotor_bank.orbit_checks import OrbitWatch
 from daqsvc.detectors.rotor_bank.statements import (
     DEPARTURE,
@@ -203,6 +203,7 @@ class RotorBankDetector:
         self._judge = RevolutionJudge(probes, missing=OBSERVED_SHARE, pooled=1)
         self._exact = set() if rotor.on_film else {"static_load"}
         self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
+        others = named_besides(self._modes, rotor, ac_coupled=ac_coupled)
         self._stater = BankDiagnosisBuilder(
             machine=machine,
             detector=name,
@@ -210,6 +211,7 @@ class RotorBankDetector:
             sensors=(probes[0].name, probes[1].name, keyphasor.name),
             modes=self._modes,
             faults=tuple(self._faults.values()),
+            others=others,
             rules=self._rules,
         )
         # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
@@ -239,8 +241,7 @@ class RotorBankDetector:
         self._calibration = SteadyFit() if calibrate_revolutions else None
         self._calibrated_speed = math.nan
         self._steady_motions = SteadyMotions(self._duration)
-        judged = not ac_coupled and all(is_one_fault(mode, rotor) for mode in self._modes[1:])
-        self._two_mode_rotor = rotor if judged and rotor.two_modes is not None else None
+        self._two_mode_rotor = rotor if others else None
         self._steady_faults: SteadyFaults | None = None
         self._change = _Change()
         self._speeds: deque[float] = deque(maxlen=_HUNTING_REVOLUTIONS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from daqsvc.rotor.discretise import BankMode
 from daqsvc.rotor.model import SAME_PEDESTAL, Pedestal
@@ -20,6 +20,8 @@ _PROCESS_NOISE = 1e-4
 _USUAL_ORBIT = 0.1
 """Orbit, in clearances, from which it holds for any rotor."""
 
+UNMODELLED = "unmodelled"
+"""What a change is called that no fault explains."""
 Fault = Literal["unbalance", "damping_loss", "static_load", "stiffness_loss", "rub"]
 
 
@@ -94,6 +96,23 @@ def is_one_fault(mode: RotorMode, rotor: RotorParameters) -> bool:
     }
     grown = damped > rotor.damping_ratio or mode.stiffness_ratio > 1.0
     return not grown and [name for name, does in differs.items() if does] == [fault_of(mode, rotor)]
+
+
+def named_besides(modes: Sequence[RotorMode], rotor: RotorParameters, *, ac_coupled: bool) -> tuple[str, ...]:
+    """What a bank names besides its modes: faults that none of them is, and a change that no fault explains.
+
+    Nothing, unless the rotor comes from a run-up, every mode is one fault, and the probes show the mean
+    position: only then the signatures judge the steady motion.
+
+    Args:
+        modes: the modes, healthiest first.
+        rotor: the healthy rotor.
+        ac_coupled: whether the probes show no static position.
+    """
+    if ac_coupled or rotor.two_modes is None or not all(is_one_fault(mode, rotor) for mode in modes[1:]):
+        return ()
+    known = {fault_of(mode, rotor) for mode in modes}
+    return (*(fault for fault in get_args(Fault) if fault not in known), UNMODELLED)
 
 
 def usual_process_noise(healthy: NormalisedRotor) -> float:

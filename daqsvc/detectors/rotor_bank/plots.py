@@ -26,7 +26,7 @@ def draw_bank(recording: Recording, statements: Statements, modes: Iterable[str]
     Args:
         recording: the recording.
         statements: all that the bank stated.
-        modes: names of its modes.
+        modes: names of its modes; what it states besides is drawn, too.
         prefix: what the file's name begins with, directory included.
 
     Returns:
@@ -39,7 +39,8 @@ def draw_bank(recording: Recording, statements: Statements, modes: Iterable[str]
     figure.suptitle(f"Rotor bank: {shortened(recording.source.name)}\n{good[-1].decision}", fontsize=11)
     upper, lower = figure.subplots(2, 1, sharex=True)
     turns = np.array([one.revolutions for one in good], dtype=np.float64)
-    for mode in modes:
+    others = (name for one in good for name, probability in one.probabilities.items() if probability)
+    for mode in dict.fromkeys((*modes, *others)):
         probability = [one.probabilities.get(mode, np.nan) for one in good]
         (line,) = upper.step(turns, probability, where="post", linewidth=1.8, label=mode)
         lead = [one.evidence.get(_LEAD + mode, np.nan) for one in good]

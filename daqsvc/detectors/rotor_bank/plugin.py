@@ -127,10 +127,14 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
 
     def readings(self, machine: MachineFile, settings: RotorBank) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
-        del machine
         yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
         for mode in settings.modes:
             yield Reading(ROTOR_BANK, "probabilities", mode.name)
+        if settings.calibration is not None:
+            from daqsvc.detectors.rotor_bank.build import besides  # noqa: PLC0415 - brings the compiler
+
+            for name in besides(machine, settings):
+                yield Reading(ROTOR_BANK, "probabilities", name)
 
 
 def _thresholds(bank: RotorBank) -> str:

@@ -12,7 +12,7 @@ from daqsvc.diagnosis.record import Diagnosis, Severity, silence_reason
 from daqsvc.rotor.bank import UNDETERMINED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -66,6 +66,7 @@ class BankDiagnosisBuilder:
         sensors: names of the sensors.
         modes: the modes, healthiest first.
         faults: what each mode is called.
+        others: what it names besides: faults that no mode is, and ``unmodelled``.
         rules: thresholds and the rule that declares.
     """
 
@@ -75,6 +76,7 @@ class BankDiagnosisBuilder:
     sensors: tuple[str, ...]
     modes: tuple[RotorMode, ...]
     faults: tuple[str, ...]
+    others: tuple[str, ...]
     rules: DecisionRules
 
     def state(
@@ -122,7 +124,8 @@ class BankDiagnosisBuilder:
             severity = _SEVERITIES[max(mildest, _SEVERITIES.index(severity))]
         group = tuple(names[i] for i in indices)
         if besides is not None:
-            chances = _with_others(chances, besides)
+            left = 1.0 - sum(besides.probabilities.values())
+            chances = {name: left * p for name, p in chances.items()} | dict(besides.probabilities)
             group = tuple(dict.fromkeys((*(group or (stated,)), *besides.others)))
             group = group if len(group) > 1 else ()
         statistics = {"speed": moment.speed_rpm}
@@ -139,7 +142,7 @@ class BankDiagnosisBuilder:
             decision=stated,
             changed=changed,
             severity=severity,
-            probabilities=chances,
+            probabilities=chances | {name: 0.0 for name in self.others if name not in chances},
             group=group,
             statistics=statistics,
             units={"speed": "rpm"},
@@ -215,13 +218,6 @@ class BankDiagnosisBuilder:
         severity = self.modes[mode].severity if known else "normal"
         outside = besides is not None and not besides.faults
         return "alert" if outside and severity == "normal" else severity
-
-
-def _with_others(modes: Mapping[str, float], besides: Explanation) -> dict[str, float]:
-    """The probabilities of the modes with those of what else explains the change; they sum to one."""
-    others = besides.probabilities
-    left = 1.0 - sum(others.values())
-    return {**{name: left * p for name, p in modes.items()}, **others}
 
 
 def _odds_and_evidence(report: BankReport, names: Sequence[str]) -> tuple[Floats, dict[str, float]]:

@@ -238,6 +238,16 @@ def test_what_no_fault_explains_is_unmodelled_until_the_machine_is_healthy_again
     assert {one.decision for one in said if one.revolutions > 75} == {"unmodelled", "N"}
 
 
+def test_what_a_bank_of_a_run_up_names_besides_its_modes_is_among_its_readings(calibrated):
+    machine = machine_of(calibrated)
+    detector, said = said_of(machine, [MACHINE])
+    readings = RotorBankPlugin().readings(machine, settings_of(machine))
+    listed = [one.key for one in readings if one.kind == "probabilities"]
+    assert listed == [*detector.faults, "unmodelled"]
+    assert list(said[-1].probabilities) == listed
+    assert said[-1].probabilities["unmodelled"] == 0.0
+
+
 def test_a_fault_without_a_mode_has_its_own_name(calibrated):
     few = tuple(
         (

@@ -25,6 +25,7 @@ BUILDER = BankDiagnosisBuilder(
         for name, severity in zip("NUVDL", ("normal", "alert", "danger", "alert", "alert"), strict=True)
     ),
     faults=FAULTS,
+    others=("stiffness_loss", "rub", "unmodelled"),
     rules=DecisionRules(),
 )
 
@@ -75,6 +76,7 @@ def test_what_no_mode_explains_is_as_bad_as_the_nearest_mode_and_has_its_own_evi
     said = stated(decision=2, lead=[40.0, 3.0, np.inf, 20.0, 60.0], besides=besides)
     assert (said.decision, said.group, said.severity) == ("unmodelled", (), "danger")
     assert said.evidence == {"unmodelled": 80.0}
+    assert said.probabilities["rub"] == 0.0
     assert said.probabilities["unmodelled"] == 0.97
     assert sum(said.probabilities.values()) == pytest.approx(1.0)
     assert BUILDER.severity(0, besides) == "alert"
