@@ -5,6 +5,8 @@ A shaft that does not turn evenly is followed, and what it smears is not taken f
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 import scipy.fft
@@ -124,6 +126,41 @@ def test_a_machine_nearby_hides_no_damage(part: str) -> None:
         beside(strikes(part, 10.0, strength=2.5), 0.72 * SPEED_RPM), RATE_HZ, SPEED_RPM, BEARING
     )
     assert verdict.verdict == part
+
+
+def beside_own(samples: np.ndarray, off: float) -> np.ndarray:
+    """The same with a louder machine nearby that turns nearly as fast."""
+    t = np.arange(len(samples)) / RATE_HZ
+    return samples + sum(
+        3.0 / k * np.cos(2 * np.pi * k * (1.0 + off) * SPEED_RPM / 60.0 * t + k * k) for k in range(1, 8)
+    )
+
+
+@pytest.mark.parametrize("off", [-0.029, -0.02, 0.029])
+@pytest.mark.parametrize("part", ["inner", "outer", "ball", None])
+def test_a_louder_machine_that_turns_nearly_as_fast_does_not_take_the_speed(
+    part: str | None, off: float
+) -> None:
+    samples = beside_own(strikes(part, 10.0, strength=2.0), off)
+    verdict = race_test(samples, RATE_HZ, SPEED_RPM, BEARING)
+    assert verdict.speed_rpm == pytest.approx(SPEED_RPM, rel=1e-3)
+    assert verdict.speed_seen
+    assert verdict.verdict == (part or "normal")
+    (told,) = (note for note in verdict.notes if "louder shaft" in note)
+    assert f"stand out at {(1.0 + off) * SPEED_RPM:.1f} rpm" in told
+    if part is None:
+        assert verdict.probability["normal"] <= 0.5, "this machine may be the louder one"
+
+
+@pytest.mark.parametrize("off", [-0.029, 0.029])
+@pytest.mark.parametrize("part", ["inner", "outer", "ball"])
+def test_the_speed_of_a_machine_nearby_names_no_wrong_part(part: str, off: float) -> None:
+    # This machine is the louder one, and its speed was stated as that of the other.
+    samples = beside_own(strikes(part, 10.0, strength=2.0), off)
+    t = np.arange(len(samples)) / RATE_HZ
+    samples += sum(6.0 / k * np.cos(2 * np.pi * k * SPEED_RPM / 60.0 * t + k) for k in range(1, 8))
+    with contextlib.suppress(UnfitError):  # it may be refused
+        assert race_test(samples, RATE_HZ, (1.0 + off) * SPEED_RPM, BEARING).verdict in {part, "normal"}
 
 
 def part_evidence(z: float, depth: float, order: float, limit: float) -> PartEvidence:

@@ -81,6 +81,8 @@ class RaceFeatures:
         speed_rpm: of the shaft, as its harmonics show it.
         speed_unconfirmed: why they do not confirm it; empty if they do.
         rival_rpm: the speed that they indicate instead; None if they do not.
+        beside_rpm: the speed of a louder shaft nearby, where this one has harmonics of its own; None if there
+            is none.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
@@ -96,6 +98,7 @@ class RaceFeatures:
     speed_rpm: float
     speed_unconfirmed: str
     rival_rpm: float | None
+    beside_rpm: float | None
     revolutions: float
     notes: tuple[str, ...]
     repairs: tuple[str, ...]
@@ -103,6 +106,11 @@ class RaceFeatures:
     drives: tuple[DriveLines, ...]
     covered: bool
     spectrum: EnvelopeSpectrum
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether the shaft may turn at another speed."""
+        return self.rival_rpm is not None or self.beside_rpm is not None
 
 
 def race_test(
@@ -162,6 +170,11 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         places = " and ".join(PLACES[part] for part in damaged)
         z = " and ".join(f"{evidence[part].z:.1f}" for part in damaged)
         notes.append(f"{places} stand out, each by itself (z {z}): both may be damaged")
+    if features.beside_rpm is not None:
+        notes.append(
+            f"harmonics of a louder shaft stand out at {features.beside_rpm:.1f} rpm: those at "
+            f"{features.speed_rpm:.1f} rpm are used, which are nearer to the stated speed; check the speed"
+        )
     if features.speed_unconfirmed:
         notes.append(f"the speed is not confirmed: {features.speed_unconfirmed}")
     repairs = len(features.repairs)
@@ -175,7 +188,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             repairs,
             # At another speed the lines of all parts are elsewhere, and under those of a drive a part's are
             # not seen: nothing was looked for in their places.
-            lost=MOST_UNCERTAINTY if features.rival_rpm is not None or features.covered else features.lost,
+            lost=MOST_UNCERTAINTY if features.elsewhere or features.covered else features.lost,
         ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
@@ -201,18 +214,23 @@ def race_features(
     speed, too, it is this machine that turns at it.
     """
     features = _measured(samples, rate_hz, speed_rpm, bearing, rules)
-    if features.rival_rpm is None:
-        return features
+    others: list[float] = []
+    if features.rival_rpm is not None:
+        # Half and double a speed have many of its harmonics.
+        others = [features.rival_rpm * factor for factor in (1.0, 0.5, 2.0)]
+        others = [rpm for rpm in others if abs(rpm / speed_rpm - 1.0) > NEAR]
+    named = decide(features.evidence, rules).group
+    if features.beside_rpm is not None:
+        others.append(features.beside_rpm)
     here = max(e.severity for e in features.evidence.values())
-    # Half and double a speed have many of its harmonics.
-    for rpm in (features.rival_rpm * factor for factor in (1.0, 0.5, 2.0)):
-        if abs(rpm / speed_rpm - 1.0) <= NEAR:
-            continue
+    for rpm in others:
         try:
             there = _measured(samples, rate_hz, rpm, bearing, rules).evidence
         except UnfitError:
             continue  # too few revolutions at that speed, or in doubt itself: it contradicts nothing
         part = max(PARTS, key=lambda part: there[part].severity)
+        if rpm == features.beside_rpm and part in named:
+            continue  # within the search for slip of both speeds
         if decide(there, rules).verdict != "normal" and there[part].severity > here:
             raise UnfitError(
                 "shaft speed or sample rate",
@@ -293,6 +311,7 @@ def _measured(
         speed_rpm=60.0 * shaft.rate_hz,
         speed_unconfirmed=shaft.doubt,
         rival_rpm=None if shaft.rival_hz is None else 60.0 * shaft.rival_hz,
+        beside_rpm=None if shaft.beside_hz is None else 60.0 * shaft.beside_hz,
         revolutions=revolutions,
         notes=notes if track is None else (*notes, _wander_note(track)),
         repairs=repairs,

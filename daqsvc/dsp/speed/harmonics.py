@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.fft
 
-from daqsvc.dsp.envelope import hann, running_median
+from daqsvc.dsp.envelope import EXP_MEDIAN, hann, running_median
 from daqsvc.dsp.speed.lines import OtherSpeedError, find_speed
 
 if TYPE_CHECKING:
@@ -171,6 +171,8 @@ WHOLE_SHARE = 0.4
 """Voices of half orders over those of whole ones from which on they look like harmonics themselves; the same
 of odd orders over even ones, below which they look like none."""
 CAGE_SLIP = 0.02
+KNOWN = 0.01
+"""How far the skirts of another machine's harmonics vote for its speed, as a share."""
 REMEDY = "give the speed of this recording and the rate it was sampled with"
 
 
@@ -185,6 +187,8 @@ class ShaftRate:
         doubt: why they do not confirm it; empty if they do.
         rival_hz: the rate that they indicate instead; None if they do not.
         scan: votes for all speeds about the stated one.
+        beside_hz: the rate nearby that more harmonics indicate, although the stated one has its own; None if
+            there is none.
     """
 
     rate_hz: float
@@ -193,6 +197,7 @@ class ShaftRate:
     doubt: str = ""
     rival_hz: float | None = None
     scan: SpeedScan | None = None
+    beside_hz: float | None = None
 
     def explained(self, hz: float) -> ShaftRate:
         """The same where the harmonics of another rate are known to be something else's.
@@ -232,8 +237,9 @@ def shaft_rate(
     """Refine a stated shaft rate by the harmonics of the shaft in a signal and in its envelope.
 
     The lines of 1X to 3X decide where they stand out (`find_speed`); otherwise eight harmonics vote, each
-    with a limited voice. The votes also show whether the speed is confirmed: it must have more of them than
-    any other from half to twice the stated one.
+    with a limited voice. A louder machine may turn nearly as fast: where several shafts have lines of their
+    own about the stated speed, the nearest is used. The votes also show whether the speed is confirmed: it
+    must have more of them than any other from half to twice the stated one.
 
     Args:
         series: ``[n]``, the low part of the signal, by `slow_series`.
@@ -261,6 +267,11 @@ def shaft_rate(
     beside = scan.best(np.abs(scan.share - 1.0) <= NEAR)
     if scan.votes_about(beside) > scan.votes_about(rate_hz) + NEAR_NATS:
         rate_hz, sharp = beside, True
+    beside_hz: float | None = None
+    own_hz = _own_lines(series, series_hz, stated_hz, rate_hz)
+    if own_hz is not None:
+        rate_hz, sharp, beside_hz = own_hz, True, rate_hz
+        scan = scan.apart_from(beside_hz)
     doubt, rival_hz = scan.doubt(rate_hz)
     far_hz = scan.far_ahead(rate_hz)
     # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
@@ -273,7 +284,7 @@ def shaft_rate(
             f"{60.0 * stated_hz:g} rpm: those of a machine nearby, unless the speed or the sample rate is "
             f"wrong; {REMEDY}"
         )
-    return ShaftRate(rate_hz, not doubt, sharp, doubt, rival_hz, scan)
+    return ShaftRate(rate_hz, not doubt, sharp, doubt, rival_hz, scan, beside_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,6 +318,11 @@ class SpeedScan:
         for own in (0.5, 2.0, *((1.0 - cage) * k for k in (1, 2, 3))):
             others &= np.abs(share / own - 1.0) > CAGE_SLIP
         return cls(harmonics, stated_hz, rates, harmonics.votes(rates), share, others)
+
+    def apart_from(self, known_hz: float) -> SpeedScan:
+        """The same without another machine's rate, its half and its double among the other speeds."""
+        own = [np.abs(self.rates_hz / (factor * known_hz) - 1.0) <= KNOWN for factor in (0.5, 1.0, 2.0)]
+        return replace(self, others=self.others & ~np.logical_or.reduce(own))
 
     def voted(self, tolerance: float) -> float:
         """The rate about the stated one that most harmonics indicate."""
@@ -362,6 +378,98 @@ class SpeedScan:
         votes = self.votes_about(other)
         far = votes >= OTHER_LEAST_NATS and votes - self.votes_about(rate_hz) > OTHER_NATS
         return other if far else None
+
+
+_OWN_ORDERS = (1, 2, 3)
+_OWN_LEAST = 2
+"""Lines of 1X to 3X that a shaft must have by itself beside a louder one."""
+_OWN_PADDING = 4
+_OWN_NATS = 14.0
+"""Evidence for a line that is no chance at any of some hundred places."""
+_OWN_POWER = 0.01
+"""Of the strongest line about an order: what leaks from there is less than a tenth of this."""
+_OWN_VALLEY = 0.1
+"""What is left between two lines that are two, over the lesser of them; a smeared line has no valley."""
+
+
+def _own_lines(series: Real, series_hz: float, stated_hz: float, taken_hz: float) -> float | None:
+    """The rate nearer to the stated one than another that has lines of its own; None if there is none.
+
+    Args:
+        series: ``[n]``, the low part of the signal.
+        series_hz: its samples per second.
+        stated_hz: stated revolutions per second.
+        taken_hz: the rate that most harmonics indicate.
+    """
+    if abs(taken_hz / stated_hz - 1.0) <= SAME:
+        return None
+    lines = _LowLines.of(series, series_hz)
+    found = [hz for hz in lines.peaks(stated_hz) if abs(hz / taken_hz - 1.0) > SAME]
+    for hz in sorted(found, key=lambda hz: abs(hz - stated_hz)):
+        if abs(hz - stated_hz) >= abs(taken_hz - stated_hz):
+            break
+        own = {order: at for order in _OWN_ORDERS if (at := lines.beside(order, hz, taken_hz)) is not None}
+        if len(own) >= _OWN_LEAST:
+            highest = max(own)
+            return own[highest] / highest
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class _LowLines:
+    """A finely sampled spectrum of the lowest orders.
+
+    Attributes:
+        power: ``[bins]``.
+        per_hz: bins per Hz.
+    """
+
+    power: Real
+    per_hz: float
+
+    @classmethod
+    def of(cls, series: Real, series_hz: float) -> _LowLines:
+        """The spectrum of a series."""
+        points = _OWN_PADDING * len(series)
+        spectrum = scipy.fft.rfft(series * hann(len(series)), points)
+        return cls(spectrum.real**2 + spectrum.imag**2, points / series_hz)
+
+    def peaks(self, stated_hz: float) -> list[float]:
+        """Where lines may be within `NEAR` of a rate, in Hz."""
+        first, last = (round((1.0 + side * NEAR) * stated_hz * self.per_hz) for side in (-1.0, 1.0))
+        about = self.power[first - 1 : last + 2]
+        top = np.flatnonzero((about[1:-1] > about[:-2]) & (about[1:-1] >= about[2:])) + first
+        return [float(self._vertex(int(at))) for at in top]
+
+    def beside(self, order: int, rate_hz: float, other_hz: float) -> float | None:
+        """The line at an order of a rate in Hz, if it is one by itself beside that of another rate."""
+        first, last = (round(order * (1.0 + side * NEAR) * rate_hz * self.per_hz) for side in (-1.0, 1.0))
+        if last + 2 >= len(self.power):
+            return None
+        around = self.power[first : last + 1]
+        reach = _OWN_PADDING
+        own, other = (self._highest(order * hz * self.per_hz, reach) for hz in (rate_hz, other_hz))
+        power = self.power[own]
+        if abs(own - other) < reach or not self.power[own - 1] <= power >= self.power[own + 1]:
+            return None
+        valley = float(self.power[min(own, other) : max(own, other) + 1].min())
+        noise = float(np.median(around)) / EXP_MEDIAN
+        least = max(_OWN_NATS * noise, _OWN_POWER * float(around.max()))
+        if power < least or valley > _OWN_VALLEY * min(power, self.power[other]):
+            return None
+        return self._vertex(own)
+
+    def _highest(self, place: float, reach: int) -> int:
+        """The strongest bin about a place."""
+        first = round(place) - reach
+        return first + int(np.argmax(self.power[first : first + 2 * reach + 1]))
+
+    def _vertex(self, at: int) -> float:
+        """Where a peak is between the bins, in Hz."""
+        low, middle, high = np.sqrt(self.power[at - 1 : at + 2])
+        bend = low - 2.0 * middle + high
+        shift = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
+        return float((at + shift) / self.per_hz)
 
 
 def _cage_line(series: Real, rate_hz: float, line_hz: float) -> bool:
