@@ -16,6 +16,7 @@ import numpy as np
 
 from daqsvc.bearing.race.lines import (
     HALF_WIDTH,
+    HARMONICS,
     NOTCH_BINS,
     REVOLUTIONS,
     LineEvidence,
@@ -47,6 +48,16 @@ if TYPE_CHECKING:
 
 SHARPEN_SHARE = 0.01
 """How far the deepest lines may be from the most significant comb, as a share."""
+LEAST_LINE_NATS = 3.0
+"""Evidence from which on a line stands out."""
+FAINT_SHARE = 0.02
+"""Evidence for a harmonic, over that for the strongest one, below which the part does not make it."""
+SIDEBAND_SHARE = 0.03
+"""The same of sidebands."""
+CLEAR_NATS = 100.0
+"""Evidence for a ball's line from which on its sidebands would stand out, too."""
+PLACE_SHARE = 0.002
+"""How far the deepest lines may be beyond the slip that is searched, as a share."""
 LEAST_KEPT = 0.25
 """Share of its weight that a part keeps at least when it is asked which part explains the others."""
 
@@ -189,7 +200,51 @@ class Scales:
             e = replace(e, limit=caution * rules.ball_severity_limit, steadiness_limit=0.0)
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(stated, gap, rules))
+        # Only of a part that may be named: of others nobody asks what made their lines.
+        may_be = e.z >= e.z_limit and _passed(part, e, rules) >= rules.changed_ease
+        if may_be and (reason := self._anothers(part, comb.order, order)):
+            e = replace(e, testable=False, reason=reason)
         return e
+
+    def _anothers(self, part: Part, comb: float, order: float) -> str:
+        """Why lines where a part's are looked for are something else's; empty if they are not.
+
+        Args:
+            part: the part.
+            comb: its order as its comb was found.
+            order: its order by the deepest lines.
+        """
+        nats = {h: self._nats(h * comb) for h in HARMONICS}
+        least = max(LEAST_LINE_NATS, FAINT_SHARE * max(nats.values()))
+        factor = math.gcd(*(h for h in HARMONICS if nats[h] >= least))
+        if factor > 1:
+            return _multiples(order, factor)
+        stated = fundamental(self._bearing, part)
+        own = max(nats[1], self._nats(order))
+        sides = max(self._sidebands(part, order), self._sidebands(part, comb))
+        modulated = sides >= max(LEAST_LINE_NATS, SIDEBAND_SHARE * own)
+        if part == "ball" and own >= CLEAR_NATS and not modulated:
+            return _unmodulated(order)
+        # Lines that are modulated as this part's are its own, though its dimensions are others.
+        near = abs(order / stated - 1.0) <= self._slip + PLACE_SHARE
+        return "" if near or modulated else _misplaced(order, stated)
+
+    def _sidebands(self, part: Part, order: float) -> float:
+        """The most evidence for a line at the rate that modulates a part's strikes, or beside them by it."""
+        if part == "outer":
+            return 0.0
+        cage = self._bearing.cage
+        if part == "inner":
+            return max(self._nats(h * order + side) for h in (1, 2) for side in (-1.0, 1.0))
+        places = [h * order + side * cage for h in (1, 2) for side in (-1, 1)]
+        places += [1.0 - cage, 1.0 + cage, *(h * cage for h in HARMONICS)]
+        return max(
+            self._nats(place * at) for place in places for at in (1.0 - PLACE_SHARE, 1.0, 1.0 + PLACE_SHARE)
+        )
+
+    def _nats(self, order: float) -> float:
+        """Evidence for a line in both envelopes, whatever explains it."""
+        return min(view.lines.at(order) for view in (self._square, self._log))
 
     def _drive_at(self, order: float) -> DriveLines | None:
         """The gear or motor that has a line where a part's is looked for."""
@@ -198,6 +253,30 @@ class Scales:
             if any(abs(other - order) < reach for other in drive.explained(order + 1.0)):
                 return drive
         return None
+
+
+def _multiples(order: float, factor: int) -> str:
+    """Why a part is not testable whose own order has no line."""
+    return (
+        f"only lines at multiples of order {factor * order:.3f} stand out, {factor} times its own "
+        f"{order:.3f}: something else strikes so often"
+    )
+
+
+def _unmodulated(order: float) -> str:
+    """Why a ball is not testable whose strikes are all alike."""
+    return (
+        f"strikes at order {order:.3f} are not modulated by the cage, as those of a ball are: something else "
+        "strikes so often"
+    )
+
+
+def _misplaced(order: float, stated: float) -> str:
+    """Why a part is not testable whose lines are too far from their place."""
+    return (
+        f"lines at order {order:.3f} are {abs(order / stated - 1.0):.1%} from its own {stated:.3f}, farther "
+        "than slip: check bearing and speed, or what else strikes so often"
+    )
 
 
 def _covered(order: float, drive: DriveLines) -> str:

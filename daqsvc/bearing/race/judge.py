@@ -15,6 +15,7 @@ import numpy as np
 import scipy.fft
 
 from daqsvc.bearing.race.decision import (
+    LEAST_LINE_NATS,
     MOST_MARGIN,
     MOST_UNCERTAINTY,
     EnvelopeView,
@@ -67,7 +68,6 @@ if TYPE_CHECKING:
 
 LOG_OFFSET = np.float32(1e-3)
 """Keeps the logarithm of the envelope from following its zeros."""
-LEAST_LINE_NATS = 3.0
 
 
 @dataclass(frozen=True, slots=True)

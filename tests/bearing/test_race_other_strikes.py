@@ -1,0 +1,63 @@
+"""What strikes at an order that is none of the bearing's names no part of it, and a note states why."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
+
+from daqsvc.bearing.race import race_test
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def struck(order: float, *, modulated: float = 0.0) -> NDArray[np.float64]:
+    """A good bearing, and strikes of something else at an order, modulated by the cage."""
+    x = strikes(None, 10.0)
+    turn = SPEED_RPM / 60.0 / RATE_HZ
+    random = np.random.default_rng(5)
+    at = np.cumsum(1.0 + 0.01 * random.standard_normal(int(order * turn * len(x)))) / order
+    place = np.rint(at / turn).astype(int)
+    kept = place < len(x)
+    impulses = np.zeros(len(x))
+    height = 1.0 + modulated * np.cos(2 * np.pi * BEARING.cage * at)
+    np.add.at(impulses, place[kept], height[kept])
+    pole = np.exp(-2 * np.pi * 200.0 / RATE_HZ + 2j * np.pi * 3000.0 / RATE_HZ)
+    return x + 12.0 * lfilter([1.0], [1.0, -pole], impulses).imag
+
+
+@pytest.mark.parametrize(
+    ("order", "part", "factor"),
+    [(7.292, "outer", 2), (9.45, "ball", 2), (4.35, "inner", 4), (5.25, "outer", 3)],
+)
+def test_a_family_without_the_parts_own_order_is_not_the_parts(order: float, part: str, factor: int) -> None:
+    verdict = race_test(struck(order), RATE_HZ, SPEED_RPM, BEARING)
+    assert verdict.verdict == "normal"
+    assert verdict.probability["normal"] < 0.7
+    evidence = verdict.evidence[part]
+    assert not evidence.testable
+    assert "only lines at multiples of order" in evidence.reason
+    assert f"{factor} times its own" in evidence.reason
+    assert f"{part} not testable here: {evidence.reason}" in verdict.notes
+
+
+@pytest.mark.parametrize("order", [4.6, 4.65, 4.8])
+def test_strikes_that_the_cage_does_not_modulate_are_no_balls(order: float) -> None:
+    verdict = race_test(struck(order), RATE_HZ, SPEED_RPM, BEARING)
+    assert verdict.verdict == "normal"
+    assert "not modulated by the cage" in verdict.evidence["ball"].reason
+    assert verdict.probability["normal"] <= 0.5
+    if abs(order / BEARING.ball_pass - 1.0) < 0.015:
+        assert race_test(struck(order, modulated=0.6), RATE_HZ, SPEED_RPM, BEARING).verdict == "ball"
+
+
+def test_lines_farther_from_their_place_than_slip_are_none_of_the_outer_race() -> None:
+    near = race_test(struck(1.01 * BEARING.outer), RATE_HZ, SPEED_RPM, BEARING)
+    assert near.verdict == "outer"
+    far = race_test(struck(1.024 * BEARING.outer), RATE_HZ, SPEED_RPM, BEARING)
+    assert far.verdict == "normal"
+    assert "2.4% from its own 3.585" in far.evidence["outer"].reason
