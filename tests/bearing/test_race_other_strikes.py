@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from scipy.signal import lfilter
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
-from daqsvc.bearing.race import race_test
+from daqsvc.bearing.geometry import bearing_orders
+from daqsvc.bearing.race import RaceRules, race_test
+from daqsvc.bearing.race.judge import race_features, verdict_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,3 +64,48 @@ def test_lines_farther_from_their_place_than_slip_are_none_of_the_outer_race() -
     far = race_test(struck(1.024 * BEARING.outer), RATE_HZ, SPEED_RPM, BEARING)
     assert far.verdict == "normal"
     assert "2.4% from its own 3.585" in far.evidence["outer"].reason
+
+
+@pytest.mark.parametrize(("part", "order"), [("outer", BEARING.outer), ("inner", BEARING.inner)])
+def test_strikes_that_fit_no_part_of_the_stated_bearing_are_told(part: str, order: float) -> None:
+    samples = strikes(part, 10.0, strength=2.0)
+    assert race_test(samples, RATE_HZ, SPEED_RPM, BEARING).verdict == part
+    verdict = race_test(samples, RATE_HZ, SPEED_RPM, bearing_orders("6305-2Z"))
+    assert verdict.verdict == "normal"
+    assert verdict.probability["normal"] <= 0.9
+    (told,) = (note for note in verdict.notes if "fit no part of this bearing" in note)
+    assert f"order {order:.2f}"[:-1] in told
+    assert f"stand out at {order * SPEED_RPM / 60.0:.0f}"[:-1] in told
+
+
+@pytest.mark.parametrize("part", [None, "inner", "outer", "ball"])
+def test_no_strikes_are_told_that_are_a_parts_own(part: str | None) -> None:
+    for seed in range(3):
+        verdict = race_test(strikes(part, 10.0, strength=0.3, seed=seed), RATE_HZ, SPEED_RPM, BEARING)
+        assert not any("fit no part" in note for note in verdict.notes)
+
+
+@pytest.mark.parametrize(
+    ("z", "depth", "steadiness", "why"),
+    [
+        (38.1, 0.54, 0.275, "(z 38.1), but its impacts are too uneven (steadiness 0.275 of 0.287)"),
+        (38.1, 0.1, 0.5, "(z 38.1), too small for damage (size 0.10 of 0.12)"),
+        (9.5, 0.2, 0.5, "(z 9.5), too small for damage (size 0.20, severity 1.9 of 3.0)"),
+    ],
+)
+def test_a_part_that_stands_out_and_is_not_named_has_a_note(
+    z: float, depth: float, steadiness: float, why: str
+) -> None:
+    rules = RaceRules()
+    features = race_features(strikes(None, 10.0), RATE_HZ, SPEED_RPM, BEARING, rules)
+    inner = replace(
+        features.evidence["inner"],
+        z=z,
+        depth=depth,
+        severity=z * depth,
+        steadiness=steadiness,
+        steadiness_limit=0.287,
+    )
+    verdict = verdict_of(replace(features, evidence={**features.evidence, "inner": inner}), rules, None)
+    assert verdict.verdict == "normal"
+    assert any(note.startswith(f"lines of the inner race stand out {why}") for note in verdict.notes)

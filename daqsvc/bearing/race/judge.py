@@ -34,6 +34,7 @@ from daqsvc.bearing.race.lines import (
     part_lines,
 )
 from daqsvc.bearing.race.track import shaft_track
+from daqsvc.bearing.race.unknown import unknown_strikes
 from daqsvc.bearing.race.verdict import (
     PARTS,
     PLACES,
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.track import SpeedTrack
+    from daqsvc.bearing.race.unknown import UnknownStrikes
     from daqsvc.dsp.drive_lines import DriveLines
 
 
@@ -88,6 +90,7 @@ class RaceFeatures:
         repairs: what was wrong with them and put right.
         lost: share of the record that the repairs left nothing of.
         drives: gears and motors whose lines stand out, and are taken for no part's.
+        unknown: strikes that fit no part; None if none stand out.
         covered: whether one of them has a line where a part's is looked for.
         spectrum: envelope spectrum, for figures.
     """
@@ -104,6 +107,7 @@ class RaceFeatures:
     repairs: tuple[str, ...]
     lost: float
     drives: tuple[DriveLines, ...]
+    unknown: UnknownStrikes | None
     covered: bool
     spectrum: EnvelopeSpectrum
 
@@ -157,14 +161,16 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     decision = decide(features.evidence, rules, baseline, change_db)
     evidence = features.evidence
     notes = [*features.notes, *features.repairs]
+    # At another speed the lines of all parts are elsewhere, and under those of a drive a part's are not seen:
+    # nothing was looked for in their places.
+    lost = MOST_UNCERTAINTY if features.elsewhere or features.covered else features.lost
     notes += [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
-    if decision.verdict == "normal":
-        notes += [
-            f"lines of the {PLACES[part]} stand out (z {e.z:.1f}), too small for damage (size {e.depth:.2f}, "
-            f"severity {e.severity:.1f} of {e.limit:.1f})"
-            for part, e in evidence.items()
-            if e.testable and e.z >= rules.regular_z and e.severity < e.limit
-        ]
+    if decision.verdict in {"normal", "changed"}:
+        before = None if baseline is None else baseline.evidence
+        notes += [_withheld(part, e, rules, before) for part, e in evidence.items() if _is_regular(e, rules)]
+        if features.unknown is not None:
+            notes.append(features.unknown.describe(features.speed_rpm / 60.0))
+            lost = max(lost, rules.regular_least_damage)
     if decision.both:
         damaged = [part for part in PARTS if part in decision.group]
         places = " and ".join(PLACES[part] for part in damaged)
@@ -186,9 +192,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             decision.probability,
             len(notes) - repairs,
             repairs,
-            # At another speed the lines of all parts are elsewhere, and under those of a drive a part's are
-            # not seen: nothing was looked for in their places.
-            lost=MOST_UNCERTAINTY if features.elsewhere or features.covered else features.lost,
+            lost=lost,
         ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
@@ -203,6 +207,33 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         drives=features.drives,
         spectrum=features.spectrum,
     )
+
+
+def _is_regular(e: PartEvidence, rules: RaceRules) -> bool:
+    """Whether a part has lines that no noise has, and nothing else is stated of it."""
+    return e.testable and e.z >= rules.regular_z
+
+
+def _withheld(
+    part: Part, e: PartEvidence, rules: RaceRules, before: Mapping[Part, PartEvidence] | None
+) -> str:
+    """Why a part is not named although its lines stand out."""
+    found = f"lines of the {PLACES[part]} stand out (z {e.z:.1f})"
+    depth_limit = rules.ball_depth_limit if part == "ball" else rules.depth_limit
+    if e.severity < e.limit:
+        return (
+            f"{found}, too small for damage (size {e.depth:.2f}, severity {e.severity:.1f} of {e.limit:.1f})"
+        )
+    if e.depth < depth_limit:
+        return f"{found}, too small for damage (size {e.depth:.2f} of {depth_limit:.2f})"
+    if e.steadiness < e.steadiness_limit:
+        return (
+            f"{found}, but its impacts are too uneven (steadiness {e.steadiness:.3f} of "
+            f"{e.steadiness_limit:.3f}): damage, a loose part or a rub may make them"
+        )
+    if before is not None and before[part].z >= before[part].z_limit:
+        return f"{found}, as they did in the healthy run (z {before[part].z:.1f}): they have not grown enough"
+    return f"{found}, but something else has stronger ones: it may make these, too"
 
 
 def race_features(
@@ -317,6 +348,7 @@ def _measured(
         repairs=repairs,
         lost=float(np.diff(holes, axis=1).sum()),
         drives=drives,
+        unknown=unknown_strikes((square.lines, log.lines), bearing, revolutions),
         covered=bool(scales.covered),
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
