@@ -103,6 +103,18 @@ def test_a_mate_that_turns_as_balls_pass_is_told_and_the_bearing_goes_first() ->
     assert note.endswith("taken for the bearing's")
 
 
+def test_a_part_is_less_sure_whose_order_a_gear_has_too() -> None:
+    alone = race_test(strikes("outer", 10.0, strength=2.0, seed=5), RATE_HZ, SPEED_RPM, BEARING)
+    beside = race_test(
+        geared(61, 17) + strikes("outer", 10.0, strength=2.0, seed=5), RATE_HZ, SPEED_RPM, BEARING
+    )
+    assert alone.verdict == beside.verdict == "outer"
+    assert any("taken for the bearing's" in note for note in beside.notes)
+    assert alone.probability["outer"] > 0.9
+    assert 0.6 < beside.probability["outer"] <= 0.7
+    assert sum(beside.probability.values()) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("part", ["inner", "outer"])
 def test_a_motor_is_no_damaged_bearing(part: str) -> None:
     # The part's line is at twice the mains.

@@ -520,3 +520,21 @@ def less_confident(
         for part in PARTS:
             shares[part] = shares.get(part, 0.0) + normal_share / len(PARTS)
     return shares
+
+
+SHARED_UNCERTAINTY = 0.3
+"""Of a part whose order a gear seems to have, too: a convention."""
+
+
+def shared_belief(probability: Mapping[str, float], part: str) -> dict[str, float]:
+    """Shares of belief in which a part gives to "normal" what a gear may have made.
+
+    Args:
+        probability: share of belief per word.
+        part: whose lines a gear may have made.
+    """
+    given = SHARED_UNCERTAINTY * probability.get(part, 0.0)
+    return dict(probability) | {
+        part: probability.get(part, 0.0) - given,
+        "normal": probability.get("normal", 0.0) + given,
+    }

@@ -23,6 +23,7 @@ from daqsvc.bearing.race.decision import (
     decide,
     less_confident,
     refuse_rivals,
+    shared_belief,
     view_of,
 )
 from daqsvc.bearing.race.lines import (
@@ -91,6 +92,7 @@ class RaceFeatures:
         lost: share of the record that the repairs left nothing of.
         drives: gears and motors whose lines stand out, and are taken for no part's.
         unknown: strikes that fit no part; None if none stand out.
+        shared: parts whose order a gear seems to have, too.
         covered: whether one of them has a line where a part's is looked for.
         spectrum: envelope spectrum, for figures.
     """
@@ -108,6 +110,7 @@ class RaceFeatures:
     lost: float
     drives: tuple[DriveLines, ...]
     unknown: UnknownStrikes | None
+    shared: tuple[Part, ...]
     covered: bool
     spectrum: EnvelopeSpectrum
 
@@ -184,16 +187,15 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     if features.speed_unconfirmed:
         notes.append(f"the speed is not confirmed: {features.speed_unconfirmed}")
     repairs = len(features.repairs)
+    probability = less_confident(decision.probability, len(notes) - repairs, repairs, lost=lost)
+    for part in features.shared:
+        if part in decision.group:
+            probability = shared_belief(probability, part)
     return RaceVerdict(
         verdict=decision.verdict,
         group=decision.group,
         evidence=features.evidence,
-        probability=less_confident(
-            decision.probability,
-            len(notes) - repairs,
-            repairs,
-            lost=lost,
-        ),
+        probability=probability,
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
         speed_rpm=features.speed_rpm,
@@ -322,6 +324,11 @@ def _measured(
     drives = drive_lines(line_levels, shaft.rate_hz, sharp=shaft.sharp) if track is None else ()
     ambiguous = [drive for drive in drives if _is_bearings(drive, bearing, rules.slip)]
     notes = (*notes, *(f"{drive.describe_as_doubt()}: taken for the bearing's" for drive in ambiguous))
+    shared = tuple(
+        part
+        for part in PARTS
+        if any(_is_at(drive, fundamental(bearing, part), rules.slip) for drive in ambiguous)
+    )
     drives = tuple(drive for drive in drives if drive not in ambiguous)
     for drive in drives:
         if drive.mate_teeth is not None and drive.spacing is not None:
@@ -349,6 +356,7 @@ def _measured(
         lost=float(np.diff(holes, axis=1).sum()),
         drives=drives,
         unknown=unknown_strikes((square.lines, log.lines), bearing, revolutions),
+        shared=shared,
         covered=bool(scales.covered),
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
@@ -361,7 +369,12 @@ def _measured(
 def _is_bearings(drive: DriveLines, bearing: BearingOrders, slip: float) -> bool:
     """Whether a gear's mate would turn as often as a part is struck, or as the cage turns."""
     own = (*(fundamental(bearing, part) for part in PARTS), bearing.cage)
-    return drive.kind == "gear" and any(abs((drive.spacing or 0.0) / order - 1.0) <= slip for order in own)
+    return drive.kind == "gear" and any(_is_at(drive, order, slip) for order in own)
+
+
+def _is_at(drive: DriveLines, order: float, slip: float) -> bool:
+    """Whether the sidebands of a drive are as far apart as an order."""
+    return abs((drive.spacing or 0.0) / order - 1.0) <= slip
 
 
 def _occupied(samples: NDArray[np.float64], rate_hz: float, rules: RaceRules) -> float | None:
