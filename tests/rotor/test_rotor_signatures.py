@@ -216,6 +216,34 @@ def test_a_change_without_harmonics_is_never_a_rub_first():
     assert max(scores.values()) - scores["rub"] < 5.0
 
 
+@pytest.mark.parametrize("share", [0.0001, 0.004, 0.03])
+@pytest.mark.parametrize("laval", [True, False])
+def test_a_shift_with_forward_1x_and_nothing_else_is_never_a_rub_first(share: float, *, laval: bool):
+    """Of the pulse's many shapes there is always one that moves these two as they moved."""
+    machine = healthy(1.3, laval=laval, ellipticity=0.0 if laval else 0.2)
+    variance = np.full(5, (share * machine.amplitude_um) ** 2 + machine.floor_um2)
+    for shift in np.exp(1j * np.radians(np.arange(0.0, 360.0, 30.0))):
+        for turned in (0.3, -0.2j, -0.4 + 0.3j):
+            change = only(0, 4.0 * shift) + only(1, turned * machine.baseline[1])
+            best, scores = judged(change, machine, variance)
+            assert best != "rub"
+            if share < 0.001:  # its harmonics would be seen
+                assert max(scores.values()) - scores["rub"] > 10.0
+
+
+def test_what_a_machine_wanders_by_does_not_hide_that_nothing_touches():
+    machine = healthy(1.3, rotor=replace(ROTOR, clearance_um=60.0))
+    machine = replace(machine, baseline=machine.baseline + only(0, -20.0j))
+    room = 60.0 - 20.0 - abs(machine.baseline[1])
+    variance = np.full(5, (1e-4 * machine.amplitude_um) ** 2 + machine.floor_um2)
+    linear = only(0, -0.6j * room) + only(1, 0.3 * room * machine.baseline[1] / abs(machine.baseline[1]))
+    best, scores = judged(linear, machine, variance)
+    assert best != "rub"
+    assert max(scores.values()) - scores["rub"] > 10.0
+    touched = linear + only(2, 0.03 * room)
+    assert judged(touched, machine, variance)[0] == "rub"
+
+
 def test_motion_that_does_not_repeat_is_a_mark_of_contact():
     machine = healthy(0.6, laval=False)
     angle = math.radians(140.0)

@@ -20,7 +20,7 @@ from daqsvc.rotor.synchronous.departure import (
     turn_per_revolution,
 )
 from daqsvc.rotor.synchronous.speed_law import SpeedLaw, learn
-from daqsvc.rotor.synchronous.vectors import HARMONICS, Healthy
+from daqsvc.rotor.synchronous.vectors import FLOOR, HARMONICS, Healthy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,8 +36,6 @@ SPEED_TOLERANCE = 0.05
 
 _VISIBLE_NATS = 20.0
 """Departure of about one false alarm in 10,000 revolutions."""
-_FLOOR = 0.002
-"""Part of the 1X amplitude that no average resolves: the sensor chain is not better than that."""
 _NOISE_FLOOR = 1e-3
 """The same of the residual: rounding of the recording."""
 _EDGE_SAMPLES = 0.29
@@ -146,7 +144,7 @@ class Calibration:
             self.variance,
             self.noise,
             self.noise_variance,
-            (_FLOOR * self.amplitude_um) ** 2,
+            self.healthy.floor_um2,
             speed_slope=slope,
             amplitude_um=self.amplitude_um,
             law=self.law,
@@ -352,7 +350,7 @@ def _refuse_unsteady(
         assumed: whether the angle rests on a stated speed.
     """
     amplitude = float(np.median(np.abs(moved[:, 1])))
-    memory, floor = _memory(rotor, speed_rad_s), (_FLOOR * amplitude) ** 2
+    memory, floor = _memory(rotor, speed_rad_s), (FLOOR * amplitude) ** 2
     _, slope = rotor.speed_slope(speed_rad_s)
     guard = amplitude * slope * deviation
     if law is not None:

@@ -4,7 +4,8 @@ A support that gives way, a load, more unbalance, less damping: all of them leav
 linear rotor that turns steadily moves at 0 and 1 times its speed only. Backward 1X is no mark: a support that
 is softer in one direction makes it. Contact pushes for a part of each revolution, so it leaves harmonics.
 Where they do not stand out, a change that the pulse of a rub happens to fit is no rub, unless noise would
-hide them and the rotor's model holds. It then predicts how such a pulse moves mean position and 1X together.
+hide them, the rotor's model holds, and backward 1X or 3X has moved with it. The model then predicts how such
+a pulse moves them together. A pulse can be made to fit any shift of the mean position with any forward 1X.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor.synchronous.vectors import BACKWARD, DC, FORWARD, HARMONICS, TWICE, Healthy
+from daqsvc.rotor.synchronous.vectors import BACKWARD, BEYOND_2X, DC, FORWARD, HARMONICS, TWICE, Healthy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,6 +40,10 @@ _2X_OF_CONTACT = 0.01
 _ORBIT_POINTS = 64
 _TURNING = np.exp(1j * np.outer(2.0 * np.pi * np.arange(_ORBIT_POINTS) / _ORBIT_POINTS, HARMONICS))
 _VISIBLE = 3.0
+_LEAK = 0.01
+"""Part of a change that backward 1X and 3X may move by on a rotor that is not exactly a linear one."""
+_IN_PLANE = 0.5
+"""How far backward 1X may be from what forward 1X makes of it on an elliptic orbit, as a part of that."""
 
 
 def has_marks(change: Complexes, variance: Floats) -> bool:
@@ -51,6 +56,36 @@ def has_marks(change: Complexes, variance: Floats) -> bool:
     moved = float(np.abs(change).max())
     twice = np.abs(change[TWICE]) ** 2 / (variance[TWICE] + (_LINEAR_2X * moved) ** 2)
     return float(twice.sum()) > _LEAST_NATS
+
+
+def moves_besides(change: Complexes, variance: Floats, healthy: Healthy) -> bool:
+    """Whether backward 1X or 3X has moved by more than mean position and forward 1X bring with them.
+
+    An elliptic orbit that grows does so in both senses: that part of backward 1X is a linear rotor's.
+
+    Args:
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, um.
+        variance: float64, as many, um^2.
+        healthy: the machine before.
+    """
+    leak = (_LEAK * float(np.abs(change).max())) ** 2
+    forward, backward = healthy.baseline[FORWARD], healthy.baseline[BACKWARD]
+    in_plane = np.conj(change[FORWARD] / forward) * backward if forward else 0.0
+    nats = np.abs(change[BEYOND_2X]) ** 2 / (variance[BEYOND_2X] + leak)
+    beside = abs(change[BACKWARD] - in_plane) ** 2
+    beside /= variance[BACKWARD] + leak + (_IN_PLANE * abs(in_plane)) ** 2
+    alone = abs(change[BACKWARD]) ** 2 / (variance[BACKWARD] + leak)
+    return bool(max((min(alone, beside), *nats.tolist())) > _LEAST_NATS)
+
+
+def resolved(variance: Floats, healthy: Healthy) -> Floats:
+    """Variance of the measurement alone, um^2: what a machine wanders by hides no harmonics of contact.
+
+    Args:
+        variance: float64, of a change, um^2, the wander of `Healthy.floor_um2` included.
+        healthy: the machine before.
+    """
+    return np.maximum(variance - healthy.floor_um2, 0.0)
 
 
 def marks_would_show(change: Complexes, variance: Floats) -> bool:
@@ -119,8 +154,9 @@ def fills_clearance(position: Complexes, change: Complexes, variance: Floats, he
     """
     if not reaches_wall(position, healthy):
         return False
-    if contact_would_show(change, variance) and not (
-        has_marks(change, variance) or whirls_around(position, healthy)
+    alone = resolved(variance, healthy)
+    if contact_would_show(change, alone) and not (
+        has_marks(change, alone) or whirls_around(position, healthy)
     ):
         return False
     others = [DC, BACKWARD, *TWICE]

@@ -30,7 +30,13 @@ import numpy as np
 
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.by_two_modes import less_damped, loaded, on_film, softer
-from daqsvc.rotor.synchronous.contact import fills_clearance, has_marks, marks_would_show
+from daqsvc.rotor.synchronous.contact import (
+    fills_clearance,
+    has_marks,
+    marks_would_show,
+    moves_besides,
+    resolved,
+)
 from daqsvc.rotor.synchronous.pulses import crack, rub_pulse
 from daqsvc.rotor.synchronous.vectors import (
     BACKWARD,
@@ -390,10 +396,12 @@ def _rub(
         return max(pulse, anything(change, variance, healthy) + UNMODELLED_NATS), 0.0
     if shaken or has_marks(change, variance):
         return pulse, 0.0
-    if marks_would_show(change, variance):
+    alone = resolved(variance, healthy)
+    if marks_would_show(change, alone) and not has_marks(change, alone):
         return pulse, _NO_CONTACT_NATS
     # Where the rotor's model holds, it gives how a pulse moves the mean position and both senses of 1X.
-    return pulse, 0.0 if healthy.modelled else _HIDDEN_CONTACT_NATS
+    predicted = healthy.modelled and moves_besides(change, variance, healthy)
+    return pulse, 0.0 if predicted else _HIDDEN_CONTACT_NATS
 
 
 def anything(change: Complexes, variance: Floats, healthy: Healthy) -> float:

@@ -177,6 +177,10 @@ DC, FORWARD, BACKWARD = (HARMONICS.index(k) for k in (0, 1, -1))
 TWICE = [HARMONICS.index(k) for k in (2, -2)]
 BEYOND_1X = slice(TWICE[0], None)
 """2X and, where it is there, 3X."""
+BEYOND_2X = slice(len(HARMONICS), None)
+"""3X, where it is there."""
+FLOOR = 0.002
+"""Part of the 1X amplitude that no average resolves: the sensor chain is not better than that."""
 
 SPREADS = np.array([0.1, 0.3, 1.0, 3.0])
 """Sizes that a change may have, in parts of the healthy orbit."""
@@ -208,6 +212,11 @@ class Healthy:
     def amplitude_um(self) -> float:
         """Amplitude A of the healthy whirl, the measure of every change."""
         return float(np.sqrt(np.sum(np.abs(self.baseline[1:]) ** 2)))
+
+    @property
+    def floor_um2(self) -> float:
+        """Square of a difference that no number of revolutions resolves."""
+        return float((FLOOR * abs(self.baseline[FORWARD])) ** 2)
 
     @property
     def whirl_um(self) -> float:
