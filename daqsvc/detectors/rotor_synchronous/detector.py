@@ -264,7 +264,7 @@ class RotorSynchronousDetector:
         if verdict.quality != "good":
             revolution = revolution.unusable()
         calibrating = self._watch.calibration is None
-        reports = self._watch.evaluate(revolution.vector, revolution.orbit)
+        reports = self._watch.evaluate(revolution.vector, revolution.orbit, settled=revolution.settled)
         self._ends.append(self._turns.origin + int(revolution.vector.end_index[0]))
         if calibrating and self._watch.calibration is not None:
             self._look_at_baseline(self._watch.calibration)

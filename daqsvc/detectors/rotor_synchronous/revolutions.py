@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 SpeedReference: TypeAlias = KeyphasorProbe | Literal["fixed", "orbit"]
 """What gives the shaft angle: a keyphasor, the stated speed, or the orbit's own 1X around it."""
 
+_SETTLED = 12
+"""Revolutions of a keyphasor until each of its edges is placed by those around it. Before, an edge may lie
+anywhere between two samples, and 1X turns with it."""
 _MIN_PROBE_SPREAD = 0.5
 """Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
 
@@ -40,12 +43,14 @@ class Revolution:
             revolution does not begin at the mark.
         vector: its synchronous vector; the end is counted from the first sample of the stream.
         trusted: whether the angle is known.
+        settled: whether it is known as well as it ever is: a keyphasor has given edges for a while.
     """
 
     raw: Floats
     orbit: Revolutions
     vector: SynchronousVectors
     trusted: bool
+    settled: bool = True
 
     def unusable(self) -> Revolution:
         """The same revolution without anything that could be judged."""
@@ -176,6 +181,7 @@ class RevolutionStream:
         self._cutter.reset()
         self._cutter_index = self._held_index = first_index
         self._held = np.empty((0, 2))
+        self._since_begin = 0
 
     def _cut(self, values: Floats) -> Iterator[Revolution]:
         probes = values[:, :2] * self._um_per_unit
@@ -205,4 +211,6 @@ class RevolutionStream:
                 trusted=revolutions.trusted[i : i + 1],
             )
             trusted = bool(revolutions.trusted[i])
-            yield Revolution(raw[begin + start : begin + end], orbit, vectors[i : i + 1], trusted)
+            self._since_begin = self._since_begin + 1 if trusted else 0
+            settled = marker is None or self._since_begin > _SETTLED
+            yield Revolution(raw[begin + start : begin + end], orbit, vectors[i : i + 1], trusted, settled)

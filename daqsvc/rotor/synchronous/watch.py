@@ -255,13 +255,16 @@ class RotorWatch:
             return "calibrating"
         return "watching" if self._onset is None else "departed"
 
-    def evaluate(self, vectors: SynchronousVectors, orbits: Revolutions | None = None) -> list[WatchReport]:
+    def evaluate(
+        self, vectors: SynchronousVectors, orbits: Revolutions | None = None, *, settled: bool = True
+    ) -> list[WatchReport]:
         """Take in revolutions, in order; one report for each that could be fitted.
 
         Args:
             vectors: their synchronous vectors in um.
             orbits: their samples in um; without them the way from one orbit to the next cannot tell
                 unbalance from loss of damping.
+            settled: whether their angle is as exact as that of the baseline. If not, they raise no alarm.
         """
         reports = []
         ends = [] if orbits is None else [*orbits.starts[1:].tolist(), len(orbits.xy)]
@@ -273,10 +276,10 @@ class RotorWatch:
                 z = orbits.xy[part, 0] + 1j * orbits.xy[part, 1]
                 self._orbits.add(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z)
             if one.usable[0]:
-                reports.append(self._take(one))
+                reports.append(self._take(one, settled=settled))
         return reports
 
-    def _take(self, one: SynchronousVectors) -> WatchReport:
+    def _take(self, one: SynchronousVectors, *, settled: bool) -> WatchReport:
         if self.calibration is None:
             return self._calibrate(one)
         moved, speed = compensated(
@@ -295,9 +298,8 @@ class RotorWatch:
         )
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
-        evidence = (
-            self._test.add(row.vector, self._floored(row.noise), row.speed) if self._tests(row) else None
-        )
+        tests = self._tests(row) and (settled or self._onset is not None)
+        evidence = self._test.add(row.vector, self._floored(row.noise), row.speed) if tests else None
         departed = evidence is not None and evidence.departed
         looked = False
         if departed and evidence is not None:

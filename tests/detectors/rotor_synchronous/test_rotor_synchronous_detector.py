@@ -210,6 +210,23 @@ def test_a_calibration_of_an_earlier_time_begins_at_once(steady, grown):
     assert said[-1].statistics["calibration.revolutions"] == 50.0
 
 
+def test_a_pulse_with_sharp_edges_is_no_change_at_the_start_of_the_next_recording():
+    """Its edges lie anywhere between two samples, until each is placed by those around it."""
+    rng = np.random.default_rng(3)
+    turns = np.arange(round(300 * 102.4)) / 102.4 + 0.3
+    whirl = 40.0 * np.exp(2j * np.pi * turns) - 15.0j
+    noise_um = 0.5 * rng.standard_normal((2, len(turns)))
+    pulse = np.where(np.mod(turns, 1.0) < 0.06, -2.0, -10.0)
+    recorded = np.stack([whirl.real + noise_um[0], whirl.imag + noise_um[1], pulse], axis=1)
+    samples = recorded.astype(np.float32)
+    healthy = detector(speed_rpm=RPM / 1.6)
+    run(healthy, samples)
+    again = detector(speed_rpm=RPM / 1.6, calibration=healthy.watch.calibration)
+    said = run(again, samples)
+    assert course(said)[-1] == "normal"
+    assert "departure" not in course(said)
+
+
 @pytest.mark.parametrize("from_file", [False, True])
 def test_a_run_up_gives_a_name_with_less_of_a_lead(steady, from_file):
     """The margin is stated, as it is the threshold of the name."""
