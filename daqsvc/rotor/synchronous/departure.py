@@ -184,6 +184,19 @@ class DepartureTest:
         reference = before / length[:, np.newaxis]
         return self._judge(windows, recent, length, reference)
 
+    def look_at(self, vector: Complexes, speed: float, turned_um: float) -> DepartureEvidence:
+        """Compare one revolution with all before, without taking it in: its angle is less exact than theirs.
+
+        Args:
+            vector: complex128 ``[5]``, its synchronous vector in um, 1X compensated for its speed.
+            speed: its relative deviation from the speed of calibration.
+            turned_um: standard deviation of what its angle leaves uncertain, in um.
+        """
+        reference, length = self.reference_before(0)
+        variance = self.spread.of_means(1.0, float(length), speed) + turned_um**2
+        nats = float((np.abs(vector - reference) ** 2 / variance).sum())
+        return DepartureEvidence(nats, 0.0, 1, departed=nats > self.threshold_nats)
+
     def _judge(
         self, windows: NDArray[np.int64], recent: Complexes, length: Floats, reference: Complexes
     ) -> DepartureEvidence:

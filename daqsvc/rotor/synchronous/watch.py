@@ -151,6 +151,8 @@ _SEGMENT_THRESHOLD_NATS = 30.0
 """A changed machine is less steady than a healthy one: only clear further changes begin a new segment."""
 _KEPT = 512
 """Revolutions that identification can reach back."""
+_PLACED_WITHIN = 0.5
+"""Samples within which a keyphasor's edge lies while no others place it."""
 _ABRUPT = 4
 """Revolutions in the window of a departure up to which its transient is examined."""
 
@@ -264,7 +266,8 @@ class RotorWatch:
             vectors: their synchronous vectors in um.
             orbits: their samples in um; without them the way from one orbit to the next cannot tell
                 unbalance from loss of damping.
-            settled: whether their angle is as exact as that of the baseline. If not, they raise no alarm.
+            settled: whether their angle is as exact as that of the baseline. If not, only a change that the
+                angle cannot explain raises an alarm.
         """
         reports = []
         ends = [] if orbits is None else [*orbits.starts[1:].tolist(), len(orbits.xy)]
@@ -298,8 +301,12 @@ class RotorWatch:
         )
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
-        tests = self._tests(row) and (settled or self._onset is not None)
-        evidence = self._test.add(row.vector, self._floored(row.noise), row.speed) if tests else None
+        evidence = None
+        if self._onset is None and not settled:
+            turned_um = _PLACED_WITHIN * 2.0 * math.pi / float(one.samples[0]) * self.calibration.amplitude_um
+            evidence = self._test.look_at(row.vector, row.speed, turned_um)
+        elif self._tests(row):
+            evidence = self._test.add(row.vector, self._floored(row.noise), row.speed)
         departed = evidence is not None and evidence.departed
         looked = False
         if departed and evidence is not None:
