@@ -192,3 +192,22 @@ def test_a_machine_file_with_errors_is_told_like_check_does(
     bad.write_text("schema_version = 1\n")
     assert main(["analyze", str(bad), "a.npz"]) == 2
     assert "Remedy" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("speed", [f"{SPEED_RPM}", f"orbit:{SPEED_RPM}"])
+def test_without_a_keyphasor_a_calibration_asks_for_no_shaft_angle(
+    analyze: Callable[..., Any], calibration: Path, tmp_path: Path, speed: str
+) -> None:
+    """A recording begins where it begins: the phase of 1X is no fault, its size is."""
+    files = []
+    for seed, change in enumerate((None, None, UNBALANCE)):
+        orbit = Orbit(seed=seed) if change is None else Orbit(change=change)
+        begin = (13 + 20 * seed) if change is None else 85 * 64 + 17
+        orbit.x, orbit.y = orbit.x[begin:], orbit.y[begin:]
+        files.append(orbit.save(tmp_path / f"{seed}.npz"))
+    options = ["--probes", "x,y", "--speed-rpm", speed, "--calibration", calibration]
+    code, found, err = analyze(*files, *options)
+    assert (code, err) == (0, "")
+    assert [one["verdict"] == "normal" for one in found] == [True, True, False]
+    assert "unbalance" in found[2]["group"]
+    assert all("phase" in " ".join(one["data_quality"]["problems"]) for one in found)

@@ -25,6 +25,7 @@ from daqsvc.detectors.rotor_synchronous.recorded_speed import (
     speed_of,
     too_short,
 )
+from daqsvc.detectors.rotor_synchronous.revolutions import RevolutionStream
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.detectors.shaft.verdict import Instant, ModeStep, RotorAlarm, RotorVerdict, Trace
 from daqsvc.diagnosis.detector import Window
@@ -35,7 +36,7 @@ from daqsvc.dsp.quality import recorded as checks
 from daqsvc.dsp.quality.recorded import ClippedProbeError, Complaint, DataQuality
 from daqsvc.dsp.quality.unit import doubt_size, refuse_size, to_um
 from daqsvc.rotor.calibration.file import baseline_at
-from daqsvc.rotor.synchronous.baseline import Calibration, compensated
+from daqsvc.rotor.synchronous.baseline import Calibration, begun_at, compensated
 from daqsvc.rotor.synchronous.departure import threshold_for
 from daqsvc.rotor.synchronous.severity import levels
 from daqsvc.rotor.synchronous.signatures import likelihoods
@@ -232,17 +233,21 @@ def _judge(
     healthy = _healthy_state(setup, speed.rpm)
     if healthy is None and setup.calibrations:
         quality = quality.with_problem(_learnt_anew(setup, speed.rpm))
+    probes = (
+        Probe(setup.probes[0], 0, setup.probe_angles_deg[0]),
+        Probe(setup.probes[1], 1, setup.probe_angles_deg[1]),
+    )
+    if healthy is not None and speed.keyphasor is None:
+        first = samples[: math.ceil(setup.rules.calibrate_revolutions * period), :2]
+        healthy = _begun_with(first, healthy, setup, probes, speed.rpm, recording.rate_hz)
     setup = replace(setup, calibrations=() if healthy is None else (healthy,))
     detector = RotorSynchronousDetector(
         machine="recording",
         stream=str(recording.source),
         rate_hz=recording.rate_hz,
         speed_rpm=speed.rpm,
-        probes=(
-            Probe(setup.probes[0], 0, setup.probe_angles_deg[0]),
-            Probe(setup.probes[1], 1, setup.probe_angles_deg[1]),
-        ),
-        reference=speed.keyphasor or ("orbit" if setup.follow_orbit else "fixed"),
+        probes=probes,
+        reference=speed.keyphasor or setup.unmarked,
         rotor=setup.rotor,
         rules=replace(setup.rules, speed_uncertainty=speed.uncertainty),
         calibration=healthy,
@@ -269,6 +274,23 @@ def _healthy_state(setup: RotorSetup, speed_rpm: float) -> Calibration | None:
         if all(one.fit_error is not None for one in setup.calibrations):
             return None  # a run-up shows the rotor at any speed
         raise RefusedError(str(error)) from None
+
+
+def _begun_with(
+    first: Floats,
+    healthy: Calibration,
+    setup: RotorSetup,
+    probes: tuple[Probe, Probe],
+    speed_rpm: float,
+    rate_hz: float,
+) -> Calibration:
+    """The calibration with the shaft angle of a recording that has no keyphasor, by its first samples."""
+    turns = RevolutionStream(
+        machine="recording", rate_hz=rate_hz, speed_rpm=speed_rpm, probes=probes, reference=setup.unmarked
+    ).process(first.astype(np.float32), 0)
+    if not turns:
+        return healthy
+    return begun_at(healthy, SynchronousVectors.joined([turn.vector for turn in turns]), rate_hz)
 
 
 def _learnt_anew(setup: RotorSetup, speed_rpm: float) -> str:

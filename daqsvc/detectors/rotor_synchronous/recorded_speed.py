@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -114,6 +114,11 @@ class RotorSetup:
             )
 
     @property
+    def unmarked(self) -> Literal["orbit", "fixed"]:
+        """What gives the shaft angle where no keyphasor does."""
+        return "orbit" if self.follow_orbit else "fixed"
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the channels, in the order of their columns."""
         return self.probes if self.keyphasor is None else (*self.probes, self.keyphasor.name)
@@ -160,16 +165,16 @@ def speed_of(
     needed = LEAST_JUDGED + (0 if setup.calibrations else setup.rules.calibrate_revolutions)
     if revolutions < needed:
         raise RefusedError(too_short(revolutions, needed, setup))
+    if setup.calibrations:
+        quality = quality.with_problem(
+            "without a keyphasor the phase of 1X is that of the first revolutions: a change of phase since "
+            "the calibration cannot be seen"
+        )
     if setup.follow_orbit:
         trend = trend_of_orbit(_calibrating(recording, setup, samples), recording.rate_hz)
         if trend is not None:
             _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz) or trend)
         return Speed(setup.speed_rpm), quality
-    if setup.calibrations:
-        quality = quality.with_problem(
-            "without a keyphasor the phases of the calibration hold only if this recording begins at the "
-            "same shaft angle as the healthy one"
-        )
     return _fixed_speed(recording, setup, setup.speed_rpm, samples, quality)
 
 
@@ -217,9 +222,10 @@ def _refuse_trend(trend: Trend | None) -> None:
 def _calibrating(recording: Recording, setup: RotorSetup, samples: Floats) -> Floats:
     """The samples whose speed must be steady: of calibration, or all where that was before."""
     assert setup.speed_rpm is not None  # noqa: S101 - asked by those who follow no keyphasor
-    turns = math.inf if setup.calibrations else setup.rules.calibrate_revolutions
-    end = min(float(len(samples)), math.ceil(turns * 60.0 * recording.rate_hz / abs(setup.speed_rpm)))
-    return samples[: int(end), :2]
+    if setup.calibrations:
+        return samples[:, :2]
+    turns = setup.rules.calibrate_revolutions
+    return samples[: math.ceil(turns * 60.0 * recording.rate_hz / abs(setup.speed_rpm)), :2]
 
 
 def _fixed_speed(

@@ -281,6 +281,30 @@ def with_more(calibration: Calibration, baseline: Complexes, revolutions: int) -
     return replace(calibration, baseline=baseline, revolutions=revolutions)
 
 
+def begun_at(calibration: Calibration, vectors: SynchronousVectors, rate_hz: float) -> Calibration:
+    """The same calibration with shaft angle zero where these vectors have it.
+
+    Without a keyphasor it is where a recording begins, which is another angle each time. So the phase of 1X
+    is that of the vectors; its amplitude and all other components stay those of the calibration.
+
+    Args:
+        calibration: the healthy machine.
+        vectors: of the first revolutions, in um.
+        rate_hz: sampling rate.
+    """
+    moved, _ = compensated(vectors[vectors.usable], calibration.rotor, calibration.speed_rad_s, rate_hz)
+    if not len(moved):
+        return calibration
+    phase = float(np.angle(moved[:, 1].mean() * calibration.baseline[1].conjugate()))
+    turn = np.exp(1j * phase * np.array(HARMONICS))
+    law = calibration.law
+    return replace(
+        calibration,
+        baseline=calibration.baseline * turn,
+        law=None if law is None else replace(law, slopes_um=law.slopes_um * turn),
+    )
+
+
 def _memory(rotor: LavalRotor, speed_rad_s: float) -> float:
     """Correlation of a stirred orbit from one revolution to the next."""
     return math.exp(-2.0 * math.pi * _decay(rotor, speed_rad_s))
