@@ -12,7 +12,7 @@ import pytest
 from support.rotor_orbits import orbits
 from support.two_mode_rotors import Machine, fitted, run_up, touching, vector_of
 
-from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.signatures import likelihoods
 from daqsvc.rotor.synchronous.vectors import Healthy, synchronous_vectors
 from daqsvc.rotor.synchronous.watch import RotorWatch
@@ -75,6 +75,26 @@ def test_weaker_dampers_are_no_unbalance(speed_hz):
     ahead = leads("damping_loss", after, speed_hz)
     assert ahead["unbalance"] > 2.0
     assert min(lead for name, lead in ahead.items() if name != "unbalance") > 5.0
+
+
+def test_modes_beyond_the_run_up_leave_open_which_damper_is_weaker():
+    """The first mode loses damping, and the two modes predict another way of 1X."""
+    known = identified().beside(STATED)
+    speed_hz = 50.0
+    shape = known.two_modes
+    hidden = replace(shape, two_modes=replace(shape.two_modes, higher_modes=-0.16 + 0.06j, support_lag=1.9))
+    ratio, before = speed_hz / known.natural_frequency_hz, np.zeros(5, dtype=complex)
+    before[1] = -40.0 - 19.0j
+    less, was = (unbalance_response(ratio, known.damping_ratio * left) for left in (0.4, 1.0))
+    change = np.zeros(5, dtype=complex)
+    change[1] = before[1] * (less / was - 1.0)
+    behind = []
+    for rotor in (replace(known, two_modes=hidden), known):
+        machine = Healthy(before, math.tau * speed_hz, rotor, laval=False)
+        variance = np.full(5, (0.002 * machine.amplitude_um) ** 2)
+        scores = likelihoods(change, variance, machine, before + change)
+        behind.append(scores["unbalance"] - scores["damping_loss"])
+    assert behind[0] < 3.5 < behind[1]
 
 
 @pytest.mark.parametrize("speed_hz", SPEEDS_HZ)

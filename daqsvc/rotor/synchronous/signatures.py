@@ -108,6 +108,10 @@ _MOST_DAMPING = 1.6
 _BESIDES = 0.02
 """Probability that a fault moves a rotor in another way than its two modes predict."""
 
+_FIRST_MODE = 0.1
+"""Largest probability that less damping moves 1X as that of a Laval rotor, whatever the two modes predict.
+It is no larger than what modes beyond the run-up take of the static deflection."""
+
 _NO_CONTACT_NATS = 12.0
 """Nats by which a rub is put behind all others where its harmonics would be seen and are not."""
 _HIDDEN_CONTACT_NATS = 1.0
@@ -232,7 +236,13 @@ def _damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> floa
         return free
     moved = float(np.abs(change[[FORWARD, BACKWARD]]).max())
     rest = float(_still(change, variance, moved)[BEYOND_1X].sum())
-    return _besides(rest + less_damped(change, variance, healthy, rotor), free)
+    predicted = _besides(rest + less_damped(change, variance, healthy, rotor), free)
+    beyond = 0.0 if rotor.two_modes is None else abs(rotor.two_modes.higher_modes)
+    if not beyond:
+        return predicted
+    # Modes beyond the run-up hide which damper damps what: it may be the first mode that has lost damping.
+    first_mode = _unbalance(change, variance, healthy) - damping_misfit(change, variance, healthy)
+    return float(np.logaddexp(predicted, first_mode + math.log(min(_FIRST_MODE, beyond))))
 
 
 def _free_damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
