@@ -316,6 +316,18 @@ def test_probabilities_are_of_tempered_evidence():
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
 
 
+def test_a_name_that_is_kept_keeps_its_probabilities():
+    machine, rules = healthy(), NamingRules()
+    calibration, load = healthy_run(machine), only(0, 3.0j)
+    first = identify(load, VARIANCE, calibration, previous=None, rules=rules)
+    named = identify(load, VARIANCE, calibration, previous=first, rules=rules)
+    assert named.named
+    other = identify(only(-2, 4.0), VARIANCE, calibration, previous=named, rules=rules)
+    assert other.candidates == ("unmodelled",)
+    assert (other.verdict, other.group) == (named.verdict, named.group)
+    assert max(other.probabilities, key=lambda name: other.probabilities[name]) == other.verdict
+
+
 def test_without_a_laval_rotor_a_load_may_stiffen_the_oil_film():
     machine = healthy(laval=False, ellipticity=0.5)
     change = only(0, 8.0 + 7.0j) + only(1, 1.6) + only(-1, 1.0j)

@@ -391,3 +391,13 @@ def test_the_damping_that_is_left_allows_for_what_is_not_known():
     watch, _ = life((100, HEALTHY), (60, change), rotor=off)
     level = levels(watch.finish(), watch.calibration)["damping_loss"]
     assert level["least"] * 0.9 <= 0.09 <= level["most"] * 1.1
+
+
+def test_a_slow_drift_is_a_few_alarms_and_not_one_each_revolution():
+    """A long window shows it; the revolutions of before are no reference for what comes after."""
+    drift = [(1, with_change(dc=0.006j * step)) for step in range(500)]
+    _, reports = life((150, HEALTHY), *drift)
+    departed = [report.revolution for report in reports if report.departed]
+    assert departed
+    assert np.diff(departed).min(initial=30) >= 30
+    assert reports[-1].identification.verdict == "static_load"

@@ -577,8 +577,8 @@ def identify(
     named = may_name and agreed and "normal" not in candidates
     group = candidates
     if previous is not None and previous.named and not named:
-        # One evaluation does not remove a name.
-        group = previous.group
+        # One evaluation does not remove a name, nor what is stated with it.
+        group, probabilities = previous.group, dict(previous.probabilities)
         named = True
     return Identification(
         verdict=group[0],

@@ -241,6 +241,7 @@ class RotorWatch:
         self._healthy: Calibration | None = None
         self._begun, self._middle = 0, 0.0
         self._onset: int | None = None
+        self._reference_from = 0
         self._look = 0
         self._identification: Identification | None = None
         self._orbits = LastOrbits(_ABRUPT)
@@ -378,7 +379,7 @@ class RotorWatch:
         """Whether a revolution goes into a departure test: not while a new segment settles."""
         if self._onset is None:
             return True
-        since = row.revolution - self._onset
+        since = row.revolution - self._reference_from
         if since < _SETTLING:
             return False
         if since < _SETTLING + _LEAST_SEGMENT:
@@ -399,6 +400,8 @@ class RotorWatch:
             self._middle = self._begun + count / 2.0
             self._thrice = thrice_of([row for row in self._rows if row.revolution < onset])
         self._onset = onset
+        # A slow change is seen long after its onset: what came before belongs to the reference of before.
+        self._reference_from = max(onset, onset + window - 1 - _SETTLING)
         self._look = 0
         self._segment.clear()
 
