@@ -17,14 +17,16 @@ from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.clipped import CLIPPED_NOTE_SHARE, CLIPPED_SHARE, clipped_share
 from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE
 from daqsvc.dsp.quality.outliers import Prewhitening, blanked, despiked, find_transients, merged, runs
-from daqsvc.dsp.quality.stuck import DEAD_SHARE, dropouts
+from daqsvc.dsp.quality.stuck import DEAD_SHARE, coarse_step, dropouts
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit, refuse_still
+from daqsvc.dsp.quality.upsampled import SHARE_OF_RATE, upsampling
 from daqsvc.rounding import counted, counted_are, rounded_up
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.quality.outliers import Stretch
+    from daqsvc.dsp.quality.upsampled import Upsampling
 
     Real = NDArray[np.float64]
 
@@ -37,6 +39,14 @@ BRIDGED = 4
 LEAST_REVOLUTIONS = 25.0
 LEAST_BAND = 3.0
 """Top of the analysed band over its bottom, at least."""
+COARSE_NOTE = 0.5
+"""Step of a converter over what the channel vibrates with (r.m.s.), from which on it is told."""
+COARSE_RESTS = 0.9
+"""Share of samples that repeat the one before, from which on a coarse converter is no reason for it."""
+COARSE_LOUD = 4.0
+"""Steps of a coarse converter that a channel which often rests is away from its middle, now and then ..."""
+COARSE_OFTEN = 0.999
+"""... beyond this quantile, at least: a dead input flutters by a step or two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +87,12 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
         raise UnfitError(
             "shaft speed", f"is {speed_rpm} rpm", "give the speed: kinematic lines lie at multiples of it"
         )
-    low_hz, top_hz = band_hz[0], min(0.48 * rate_hz, band_hz[1])
+    low_hz, top_hz = band_hz[0], min(SHARE_OF_RATE * rate_hz, band_hz[1])
     if top_hz < LEAST_BAND * low_hz:
         raise UnfitError(
             "sample rate",
             f"is {rate_hz:g} Hz, which leaves the band {low_hz:g} to {top_hz:g} Hz",
-            f"sample with {rounded_up(LEAST_BAND * low_hz / 0.48, 4)} Hz or more",
+            f"sample with {rounded_up(LEAST_BAND * low_hz / SHARE_OF_RATE, 4)} Hz or more",
         )
     revolutions = len(x) / rate_hz * speed_rpm / 60.0
     if revolutions < LEAST_REVOLUTIONS:
@@ -92,7 +102,7 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
         )
     refuse_beyond_any_unit(x)
-    x, gaps, notes, repairs = _bridged(x, rate_hz)
+    x, gaps, notes, repairs = _bridged(x, rate_hz, low_hz)
     refuse_still(x)
     mended = repaired(x, rate_hz, round(60.0 * rate_hz / speed_rpm), (low_hz, top_hz))
     x = mended.values
@@ -116,7 +126,7 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
     )
 
 
-def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], list[str]]:
+def _bridged(x: Real, rate_hz: float, least_hz: float) -> tuple[Real, list[Stretch], list[str], list[str]]:
     """The channel with straight lines over what is missing, where they are long, notes, and repairs."""
     good = np.isfinite(x)
     missing = 1.0 - float(good.mean())
@@ -126,14 +136,24 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
         )
     if missing:
         x = _interpolated(x, good)
-    steady = float(np.mean(np.diff(x) == 0.0))
-    if steady > DEAD_SHARE:
-        raise UnfitError(
-            "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
-        )
-    held = dropouts(x) & good
+    notes = (
+        [f"{counted_are(int((~good).sum()), 'sample')} missing: bridged; check the bus and the device"]
+        if missing
+        else []
+    )
+    stored = upsampling(x)
+    if stored is not None:
+        notes.append(f"the channel was {stored.describe(rate_hz)}: only what was measured is used")
+        _refuse_narrow(stored, rate_hz, least_hz)
+        x = stored.joined(x)
+    measured = x if stored is None else stored.measured(x)
+    notes += _resolution(measured)
+    held = dropouts(measured)
+    if stored is not None:
+        held = stored.spread(held, len(x))
+    held &= good
     if not missing and not held.any():
-        return x, [], [], []
+        return x, [], notes, []
     lost = ~good | held
     sentences = []
     if held.any():
@@ -148,12 +168,53 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
     taper = round(GAP_TAPER_S * rate_hz)
     long = merged((max(first - taper, 0), min(last + taper, len(x))) for first, last in long)
     x = blanked(x, long, rate_hz)
-    notes = (
-        [f"{counted_are(int((~good).sum()), 'sample')} missing: bridged; check the bus and the device"]
-        if missing
-        else []
-    )
     return x, long, notes, sentences
+
+
+def _refuse_narrow(stored: Upsampling, rate_hz: float, least_hz: float) -> None:
+    """Refuse a record that was sampled too slowly, however fast it is stored.
+
+    Raises:
+        UnfitError: it is such a record.
+    """
+    top_hz = SHARE_OF_RATE * rate_hz / stored.factor
+    if top_hz < LEAST_BAND * least_hz:
+        raise UnfitError(
+            "channel",
+            f"was {stored.describe(rate_hz)}, which leaves the band {least_hz:g} to {top_hz:.0f} Hz",
+            f"sample with {rounded_up(LEAST_BAND * least_hz / SHARE_OF_RATE, 4)} Hz or more",
+        )
+
+
+def _resolution(measured: Real) -> list[str]:
+    """A note where a converter's steps are large beside what it measures.
+
+    Raises:
+        UnfitError: they are too large, or the channel is dead.
+    """
+    moves = np.diff(measured)
+    steady = float(np.mean(moves == 0.0))
+    step = coarse_step(moves)
+    deviation = float(measured.std())
+    if steady <= DEAD_SHARE and (step is None or step <= COARSE_NOTE * deviation):
+        return []
+    if step is None or steady > COARSE_RESTS:
+        raise UnfitError(
+            "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
+        )
+    away = np.quantile(np.abs(measured - np.median(measured)), COARSE_OFTEN)
+    if steady > DEAD_SHARE and away < COARSE_LOUD * step:
+        raise UnfitError(
+            "channel",
+            f"is too coarse: it moves in steps of {step:.3g}, and {steady:.0%} of its samples repeat the one "
+            "before",
+            "set a more sensitive range or gain, or check sensor and cable",
+        )
+    note = (
+        f"the channel's resolution is coarse: steps of {step:.3g}, and it vibrates with {deviation:.3g} "
+        "r.m.s.: smaller signs of damage stay unseen; set a more sensitive range or gain"
+    )
+    return [note]
 
 
 def _interpolated(x: Real, good: NDArray[np.bool_]) -> Real:

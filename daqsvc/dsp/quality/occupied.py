@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.signal
 
+from daqsvc.dsp.quality.upsampled import upsampling
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -39,6 +41,10 @@ def occupied_top_hz(samples: Real, rate_hz: float) -> float | None:
     """
     if len(samples) < 2 * _SEGMENT:
         return None
+    stored = upsampling(samples)
+    if stored is not None:
+        # Above lie images of what is below.
+        return 0.5 * rate_hz / stored.factor
     # Windowed, as strong slow lines leak far up.
     _, power = scipy.signal.welch(samples[:_MOST], rate_hz, nperseg=_SEGMENT)
     bands = power[:-1].reshape(_BANDS, -1)

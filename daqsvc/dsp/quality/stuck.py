@@ -39,6 +39,8 @@ _LEAST_RUN = 4
 _COARSE_RUN = 64
 _COARSE = 0.5
 """Least difference over the median one beyond which a converter is coarse: its channel rests by itself."""
+_ODD_MOVES = 0.01
+"""Share of the moves that may be smaller than its steps: straight lines bridge what is missing."""
 _NEAR_LIMIT = 0.025
 """So near to the extremes of all others, as a share of their range, a value is a limit."""
 _FALSE_RUNS = 1e-2
@@ -153,6 +155,19 @@ def dropped_to(signal: Floats) -> Standstill | None:
     return still if ends.max(initial=0.0) > _DROP_STEPS * steps[steps > 0].min(initial=np.inf) else None
 
 
+def coarse_step(moves: Floats) -> float | None:
+    """The step of a converter so coarse that a channel mostly moves by one of them; None if it is finer.
+
+    Args:
+        moves: differences of neighbouring samples, ``[n]``.
+    """
+    moving = np.abs(moves[moves != 0.0])
+    if not len(moving):
+        return None
+    least = float(np.quantile(moving, _ODD_MOVES, method="lower"))
+    return least if least > _COARSE * np.median(moving) else None
+
+
 def dropouts(samples: Floats) -> NDArray[np.bool_]:
     """Samples that belong to a run of one value, longer than the channel's own converter makes any.
 
@@ -169,10 +184,9 @@ def dropouts(samples: Floats) -> NDArray[np.bool_]:
         return np.zeros(n, dtype=np.bool_)
     starts = np.flatnonzero(np.concatenate(([True], steps != 0.0)))
     lengths = np.diff(starts, append=n)
-    moving = steps[steps != 0.0]
     repeated = min(float(np.mean(lengths > 1)), 0.99)
     least = max(_LEAST_RUN, math.ceil(1.0 + math.log(_FALSE_RUNS / n) / math.log(max(repeated, 1e-9))))
-    if not len(moving) or moving.min() > _COARSE * np.median(moving):
+    if rests.all() or coarse_step(steps) is not None:
         least = max(least, _COARSE_RUN)
     long = lengths >= least
     rest = samples[np.repeat(~long, lengths)]
