@@ -174,6 +174,21 @@ CLEARANCE = re.compile(r"/?C[2-5]$")
 """Suffix of the clearance inside, which does not move the orders."""
 
 
+KINDS: Mapping[str, re.Pattern[str]] = {
+    "spherical roller": re.compile(r"2(13|2[23]|3[01289]|4[0189])\d\d"),
+    "tapered roller": re.compile(r"3(0[23]|1[13]|2[0239]|3[012])\d\d"),
+    "cylindrical roller": re.compile(r"(NU|NJ|NUP|NCF|NNU|NN|NF|N)\d{3}"),
+    "needle roller": re.compile(r"(NA|RNA|NK|NKI|NKS|HK|BK)\d\d"),
+    "self-aligning ball": re.compile(r"(1[23]|2[23])\d\d(?!\d)"),
+}
+"""How designations begin whose series states a kind of bearing, as makers use them."""
+
+
+def _kind(name: str) -> str:
+    """The kind of bearing that a designation states; empty of all others."""
+    return next((kind for kind, begins in KINDS.items() if begins.match(name)), "")
+
+
 @cache
 def _entries() -> Mapping[str, Mapping[str, Any]]:
     text = files("daqsvc.bearing").joinpath("bearings.toml").read_text(encoding="utf-8")
@@ -225,13 +240,16 @@ def _known_as(designation: str) -> str:
     for name in (wanted, bare, joined, DESIGN.sub(r"\1", joined)):
         if name in known:
             return name
-    near = difflib.get_close_matches(bare, known, n=4, cutoff=0.6)
+    # Orders of another kind are no help, however near its name is.
+    kind = _kind(bare)
+    near = difflib.get_close_matches(bare, [name for name in known if _kind(name) == kind], n=4, cutoff=0.6)
     names = f"near names: {', '.join(near)}" if near else "no name in it is near"
+    of_kind = f", a {kind} bearing," if kind else ""
     stem = bare.partition("-")[0]
     # Of a known bearing, only the seals were written in an unusual way.
     meant = f" (did you mean {stem}-2RS?)" if stem in known else ""
     raise KeyError(
-        f"bearing {designation!r} is not in the catalogue; {names}{meant}. "
+        f"bearing {designation!r}{of_kind} is not in the catalogue; {names}{meant}. "
         "Give its dimensions or its orders instead: BPFI=..,BPFO=..,BSF=..,FTF=.."
     )
 

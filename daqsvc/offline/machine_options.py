@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 
 _RECORDING = "recording"
 """Name of the machine, its bus and its stream."""
+_INSTEAD_OF_BEARING = (
+    "Give --balls (or rollers, in a row), --ball-diameter-mm, --pitch-diameter-mm and --contact-deg, "
+    "or --orders BPFI=..,BPFO=..,BSF=..,FTF=.."
+)
 _ANY_ROTOR = (1.0, 0.1)
 """Natural frequency and damping ratio of a rotor that a run-up has to show."""
 
@@ -203,7 +207,8 @@ def _orders(arguments: argparse.Namespace) -> BearingOrders:
         try:
             return bearing_orders(arguments.bearing)
         except KeyError as error:
-            raise WrongValueError(f"--bearing: {error.args[0]}") from None
+            what = str(error.args[0]).partition(". ")[0]
+            raise WrongValueError(f"--bearing: {what}. {_INSTEAD_OF_BEARING}") from None
     orders = arguments.orders
     try:
         return BearingOrders(

@@ -78,6 +78,34 @@ def test_an_unknown_bearing_is_named_with_near_ones() -> None:
         bearing_orders("7205")
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("22210", "spherical roller"),
+        ("22318 EK/C3", "spherical roller"),
+        ("SKF 23120", "spherical roller"),
+        ("24024", "spherical roller"),
+        ("21310", "spherical roller"),
+        ("30206", "tapered roller"),
+        ("32008", "tapered roller"),
+        ("33110", "tapered roller"),
+        ("31308", "tapered roller"),
+        ("NU2206ECP", "cylindrical roller"),
+        ("NJ 310", "cylindrical roller"),
+        ("N 206", "cylindrical roller"),
+        ("HK1612", "needle roller"),
+        ("2205", "self-aligning ball"),
+    ],
+)
+def test_a_bearing_of_another_kind_is_named_and_no_near_name_is_of_balls(name: str, kind: str) -> None:
+    with pytest.raises(KeyError) as refused:
+        bearing_orders(name)
+    said = refused.value.args[0]
+    assert f", a {kind} bearing, is not in the catalogue; " in said
+    near = said.partition("near names: ")[2].partition(".")[0]
+    assert not {other for other in near.split(", ") if other} - {"NU205E", "NU206E", "2303", "1205"}
+
+
 def test_the_catalogue_has_200_bearings_each_with_its_source() -> None:
     assert len(catalogue()) >= 200
     for name, orders in catalogue().items():

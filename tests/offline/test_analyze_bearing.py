@@ -297,6 +297,10 @@ def test_another_unit_or_a_machine_at_rest_is_no_change_of_the_machine(
             ("--bearing", "99999", "--channels", "de", "--speed-rpm", "1797"),
             "BPFI=..,BPFO=..,BSF=..,FTF=.. [C02]",
         ),
+        (
+            ("--bearing", "22210", "--channels", "de", "--speed-rpm", "1797"),
+            "a spherical roller bearing, is not in the catalogue; no name in it is near. Give --balls (or rollers",
+        ),
         (("--orders", "BPFI=5,BPFO=3,BSF=2"), "FTF missing"),
         (("--orders", "BPFI=5,BPFI=3,BSF=2,FTF=.4"), "'BPFI=3' is no fault order"),
         (("--orders", "BPFI=-5,BPFO=3,BSF=2,FTF=.4"), "'BPFI=-5' is no fault order"),
