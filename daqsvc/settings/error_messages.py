@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, get_origin
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 from pydantic import ValidationError
 
@@ -24,6 +24,7 @@ from daqsvc.errors.machine_file import (
 from daqsvc.rounding import counted
 from daqsvc.settings.aliases import meant_key
 from daqsvc.settings.buses import Layout
+from daqsvc.settings.measures import ON_REQUEST, Measure
 from daqsvc.settings.registry import first_detector
 from daqsvc.settings.schema import (
     adapter,
@@ -55,6 +56,8 @@ _TRUE_WORDS = {"1", "on", "true", "y", "yes", "ja", "j", "oui", "si"}
 _FALSE_WORDS = {"0", "off", "false", "n", "no", "nein", "non"}
 _MOST_IN_A_ROW = 4
 """Values that belong together, e.g. the two ends of a range; whatever may be longer is a list."""
+_NO_VECTOR = (0.0, 0.0)
+"""Default of a key that takes two parts of a vector, and does nothing without them."""
 _OF_CANDUMP = "write the id of the frames, which candump shows"
 _SECRET = re.compile(r"pass|secret|token|credential", re.IGNORECASE)
 
@@ -242,6 +245,11 @@ class ErrorFormatter:
         value = value_at(self._document, path)
         allowed = self._allowed(path)
         listed = [json.dumps(item) for item in allowed]
+        if value in get_args(Measure) and set(ON_REQUEST).issuperset(allowed):
+            return (
+                "needs no entry: it is always computed where the sensor gives it",
+                "take it out of the array",
+            )
         message = (
             f"must be {' or '.join([', '.join(listed[:-1]), listed[-1]] if len(listed) > 1 else listed)}"
         )
@@ -312,6 +320,14 @@ class ErrorFormatter:
 
     def _tuple_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         field = self._field(path)
+        value = value_at(self._document, path)
+        if field is not None and field.default == _NO_VECTOR and isinstance(value, int | float):
+            # The default would undo what was meant; of sag, most is downwards.
+            example = [0.0, 0.0 - abs(float(value))]
+            if self._is_valid(path, example):
+                return "must be two numbers in brackets, x and y", (
+                    f"write e.g. {self._key(path)} = {json.dumps(example)} ({field.description})"
+                )
         if field is not None and not field.examples:
             return "must be an array", self._add(path)
         return "must be an array in brackets", self._write_example(path)

@@ -386,6 +386,15 @@ def test_a_measure_without_brackets_is_refused_with_how_to_write_it():
     assert problem.remedy.startswith('write measures = ["kurtosis"] (')
 
 
+@pytest.mark.parametrize("measure", ["peak_to_peak", "rms", "gap_voltage"])
+def test_a_measure_that_is_always_computed_needs_no_entry(measure: str) -> None:
+    listed = ('["kurtosis", "velocity_rms_2_1000", ', f'["kurtosis", "{measure}", ')
+    problem, _ = only_problem(SPECIMEN, listed)
+    assert problem.key == "pipeline.levels.measures[1]"
+    assert problem.message == "needs no entry: it is always computed where the sensor gives it"
+    assert problem.remedy == "take it out of the array"
+
+
 MOTOR = MACHINES / "motor-accelerometer.toml"
 BAND = "velocity_band_hz = [10.0, 1000.0]"
 ON_VELOCITY = ('measure = "rms"', 'measure = "velocity_rms"')

@@ -52,6 +52,14 @@ def test_static_load_has_two_directions():
     assert modes["L1"].rest == pytest.approx(0.07 - 0.07j)
 
 
+@pytest.mark.parametrize(("load", "meant"), [("15.0", "-15.0"), ("-5", "-5.0"), ("0", "0.0")])
+def test_static_load_as_one_number_is_refused_with_both_directions(load: str, meant: str) -> None:
+    problem, _ = only_problem(TWELVE, ("static_load_um = [0.0, -5.0]", f"static_load_um = {load}"))
+    assert problem.key == f"{MODES}[4].static_load_um"
+    assert problem.message == "must be two numbers in brackets, x and y"
+    assert problem.remedy.startswith(f"write e.g. static_load_um = [0.0, {meant}] (additional sag")
+
+
 def test_faults_of_a_file_that_does_not_name_them():
     assert bank_of(load_machine_file(LAVAL)).faults == {
         "N": "normal",
