@@ -299,7 +299,7 @@ def test_another_unit_or_a_machine_at_rest_is_no_change_of_the_machine(
         ),
         (
             ("--bearing", "22210", "--channels", "de", "--speed-rpm", "1797"),
-            "a spherical roller bearing, is not in the catalogue; no name in it is near. Give --balls (or rollers",
+            "a spherical roller bearing, is not in the catalogue; no name in it is near. Give --balls (or",
         ),
         (("--orders", "BPFI=5,BPFO=3,BSF=2"), "FTF missing"),
         (("--orders", "BPFI=5,BPFI=3,BSF=2,FTF=.4"), "'BPFI=3' is no fault order"),
