@@ -38,6 +38,8 @@ _SHARP_DB = 6.0
 """... and how far a narrow one rises above it."""
 _LEAST_TEETH, _MOST_TEETH = 12, 120
 """Gears with fewer are rare, as their teeth are cut away at the foot."""
+_LEAST_MATE_TEETH = 10
+"""A mate may have fewer, but then its sidebands must show about the second harmonic of the mesh, too."""
 TOP_ORDER = 2.0 * _MOST_TEETH + 4.0
 """The highest order that is examined: beside the second harmonic of a mesh."""
 _CARRIER_DB = 6.0
@@ -233,8 +235,8 @@ def _mate(lines: LineLevels, teeth: int, shaft_hz: float) -> int | None:
     """Teeth of the gear whose turning makes pairs of sidebands about a mesh; None if no such pairs show."""
     scores = {
         mate: score
-        for mate in range(_LEAST_TEETH, _MOST_TEETH + 1)
-        if (score := _pairs(lines, teeth, teeth / mate, shaft_hz)) > 0.0
+        for mate in range(_LEAST_MATE_TEETH, _MOST_TEETH + 1)
+        if (score := _pairs(lines, teeth, mate, shaft_hz)) > 0.0
     }
     if not scores:
         return None
@@ -243,9 +245,9 @@ def _mate(lines: LineLevels, teeth: int, shaft_hz: float) -> int | None:
     return max(mate for mate in scores if mate % best == 0)
 
 
-def _pairs(lines: LineLevels, teeth: int, spacing: float, shaft_hz: float) -> float:
+def _pairs(lines: LineLevels, teeth: int, mate: int, shaft_hz: float) -> float:
     """How far pairs of sidebands stand out about a mesh and its second harmonic; 0 if too few do."""
-    resolution = lines.step_hz / shaft_hz
+    spacing, resolution = teeth / mate, lines.step_hz / shaft_hz
     # At whole orders they are the shaft's own; closer than this to a carrier they are its skirt.
     if abs(spacing - round(spacing)) < 4.0 * resolution or spacing < 6.0 * resolution:
         return 0.0
@@ -256,6 +258,8 @@ def _pairs(lines: LineLevels, teeth: int, spacing: float, shaft_hz: float) -> fl
         if abs(k * spacing - round(k * spacing)) > 3.0 * resolution
     ]
     if sum(level > _SIDEBAND_DB for level in levels) < _LEAST_PAIRS or levels[0] < _SIDEBAND_DB:
+        return 0.0
+    if mate < _LEAST_TEETH and levels[len(levels) // 2] < _SIDEBAND_DB:
         return 0.0
     return sum(max(level, 0.0) for level in levels)
 

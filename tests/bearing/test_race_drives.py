@@ -30,7 +30,9 @@ def found(samples: NDArray[np.float64], shaft_hz: float = SHAFT_HZ) -> tuple[Dri
     return drive_lines(levels, shaft_hz, sharp=True)
 
 
-@pytest.mark.parametrize(("teeth", "mate"), [(23, 60), (43, 24), (61, 17), (33, 14), (19, 77)])
+@pytest.mark.parametrize(
+    ("teeth", "mate"), [(23, 60), (43, 24), (61, 17), (33, 14), (19, 77), (37, 10), (57, 10)]
+)
 def test_a_gear_and_its_mate_are_counted(teeth: int, mate: int) -> None:
     (gear,) = found(geared(teeth, mate))
     assert (gear.kind, gear.teeth, gear.mate_teeth) == ("gear", teeth, mate)
