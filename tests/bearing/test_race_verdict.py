@@ -91,7 +91,8 @@ GAPPED[100:2000] = np.nan
     ("samples", "changes", "message"),
     [
         (np.zeros(60_000), {}, r"channel is dead: 100%"),
-        (np.repeat(strikes(None, 1.0), 5), {}, r"channel is dead: 80%"),
+        (np.append(strikes(None, 1.0), np.zeros(48_000)), {}, r"channel is dead: 80%"),
+        (np.repeat(strikes(None, 1.0), 5), {}, r"sampled at 2400 Hz and upsampled .each sample 5 times."),
         (CLIPPED, {}, r"channel is clipped: .* are at -2 or 2;"),
         (GAPPED, {}, r"lacks 3.2% of its samples"),
         (np.full(60_000, np.inf), {}, r"lacks 100.0% of its samples"),
