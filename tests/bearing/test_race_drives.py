@@ -131,6 +131,23 @@ def test_a_motor_is_no_damaged_bearing(part: str) -> None:
     assert verdict.probability["normal"] <= 0.5, "damage would not be seen"
 
 
+@pytest.mark.parametrize(("rpm", "mains_hz"), [(2960.0, 50.0), (3560.0, 60.0), (2985.0, 50.0)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_motor_of_two_poles_turns_evenly_though_its_line_is_beside_2x(
+    rpm: float, mains_hz: float, seed: int
+) -> None:
+    pass_hz = 2.0 * (mains_hz - rpm / 60.0)
+    samples = motor_driven(rpm, mains_hz, pole_pass_hz=pass_hz, seed=seed)
+    t = np.arange(len(samples)) / RATE_HZ
+    beat = 1.0 + 0.3 * np.cos(2 * np.pi * pass_hz * t)
+    samples += beat * (2.0 * np.cos(4 * np.pi * mains_hz * t) + np.sin(2 * np.pi * rpm / 60.0 * t))
+    verdict = race_test(samples, RATE_HZ, rpm, BEARING)
+    assert not any("wanders" in note for note in verdict.notes)
+    assert [(drive.kind, drive.poles) for drive in verdict.drives] == [("motor", 2)]
+    assert verdict.verdict == "normal"
+    assert verdict.speed_rpm == pytest.approx(rpm, rel=3e-4)
+
+
 @pytest.mark.parametrize("part", ["inner", "outer", "ball"])
 def test_a_damaged_bearing_beside_a_gear_is_found(part: str) -> None:
     samples = geared(43, 24, knock=2.0) + strikes(part, 10.0, strength=2.0, seed=5)

@@ -40,7 +40,7 @@ LEAST_REVOLUTIONS = 25.0
 LEAST_BAND = 3.0
 """Top of the analysed band over its bottom, at least."""
 COARSE_NOTE = 0.5
-"""Step of a converter over what the channel vibrates with (r.m.s.), from which on it is told."""
+"""Step of a converter over what the channel vibrates with (r.m.s.), from which on it is noted."""
 COARSE_RESTS = 0.9
 """Share of samples that repeat the one before, from which on a coarse converter is no reason for it."""
 COARSE_LOUD = 4.0

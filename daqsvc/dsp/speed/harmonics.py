@@ -237,8 +237,8 @@ def shaft_rate(
     """Refine a stated shaft rate by the harmonics of the shaft in a signal and in its envelope.
 
     The lines of 1X to 3X decide where they stand out (`find_speed`); otherwise eight harmonics vote, each
-    with a limited voice. A louder machine may turn nearly as fast: where several shafts have lines of their
-    own about the stated speed, the nearest is used. The votes also show whether the speed is confirmed: it
+    with a limited voice. A louder machine may turn nearly as fast: where several shafts show lines about the
+    stated speed, the nearest is used. The votes also show whether the speed is confirmed: it
     must have more of them than any other from half to twice the stated one.
 
     Args:

@@ -3,8 +3,8 @@
 A support that gives way, a load, more unbalance, less damping: all of them leave the rotor linear, and a
 linear rotor that turns steadily moves at 0 and 1 times its speed only. Backward 1X is no mark: a support that
 is softer in one direction makes it. Contact pushes for a part of each revolution, so it leaves harmonics.
-Where they do not stand out, a change that the pulse of a rub happens to fit is no rub, unless noise would
-hide them, the rotor's model holds, and backward 1X or 3X has moved with it. The model then predicts how such
+Where they do not stand out, a change that the pulse of a rub happens to fit is no rub. It may be one only if
+noise would hide them, the rotor's model holds, and backward 1X or 3X has moved with it. The model then predicts how such
 a pulse moves them together. A pulse can be made to fit any shift of the mean position with any forward 1X.
 """
 
@@ -43,7 +43,7 @@ _VISIBLE = 3.0
 _LEAK = 0.01
 """Part of a change that backward 1X and 3X may move by on a rotor that is not exactly a linear one."""
 _IN_PLANE = 0.5
-"""How far backward 1X may be from what forward 1X makes of it on an elliptic orbit, as a part of that."""
+"""How far backward 1X may be from that of an elliptic orbit with the same forward 1X, as a part of that."""
 
 
 def has_marks(change: Complexes, variance: Floats) -> bool:
