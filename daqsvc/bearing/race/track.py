@@ -52,9 +52,9 @@ phase. This is more than they had in measured records of shafts that turn evenly
 HEARD_NATS = 5.0
 """Votes of a harmonic from which on it stands out by itself."""
 LOST_NATS = 0.3
-"""Most votes that such a harmonic may lose: the shaft's all become sharper together, and what sharpens one line
-and smears another follows a line that is not the shaft's. Of shafts that wandered by 2 % none lost any; beside
-the line of a motor, of a mate or of another machine one lost 0.6 to 1.7."""
+"""Most votes that such a harmonic may lose: the shaft's all become sharper together. What sharpens one line
+and smears another follows a line that is not the shaft's. Of shafts that wandered by 2 % none lost any;
+beside the line of a motor, of a mate or of another machine one lost 0.6 to 1.7."""
 LEAST_WANDER = 5e-4
 LEAST_POWER = 1e-300
 
@@ -184,7 +184,7 @@ class _HarmonicSeries:
         )
 
     def votes(self, ahead: Real) -> Real:
-        """Votes of each harmonic, ``[rows]``, for the speed that has most if the shaft is ahead by some revolutions.
+        """Votes of each harmonic, ``[rows]``, for the best speed if the shaft is ahead by some revolutions.
 
         Args:
             ahead: ``[points]``.

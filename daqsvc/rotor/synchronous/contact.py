@@ -4,8 +4,9 @@ A support that gives way, a load, more unbalance, less damping: all of them leav
 linear rotor that turns steadily moves at 0 and 1 times its speed only. Backward 1X is no mark: a support that
 is softer in one direction makes it. Contact pushes for a part of each revolution, so it leaves harmonics.
 Where they do not stand out, a change that the pulse of a rub happens to fit is no rub. It may be one only if
-noise would hide them, the rotor's model holds, and backward 1X or 3X has moved with it. The model then predicts how such
-a pulse moves them together. A pulse can be made to fit any shift of the mean position with any forward 1X.
+noise would hide them, the rotor's model holds, and backward 1X or 3X has moved with it. The model then
+predicts how such a pulse moves them together. A pulse can be made to fit any shift of the mean position with
+any forward 1X.
 """
 
 from __future__ import annotations
