@@ -148,11 +148,11 @@ def _history(
         if not group:
             continue
         settled = _fault(diagnosis.decision, faults) is not None
-        if group == ("normal",):
+        if group[0] == "normal":  # a fault may look like it
             departed = named = onset = None
         elif departed is None:
             departed, onset = diagnosis, diagnosis.first_index
-        if settled and group != ("normal",) and (named is None or set(_faults(named, faults)) != set(group)):
+        if settled and group[0] != "normal" and (named is None or set(_faults(named, faults)) != set(group)):
             named = diagnosis
         step = ModeStep(math.floor(diagnosis.revolutions or 0.0), group[0], group, settled)
         if not steps or (steps[-1].group, steps[-1].named) != (step.group, step.named):
