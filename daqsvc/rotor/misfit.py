@@ -51,6 +51,10 @@ _LEAST_CHANGE = 0.1
 """Part of the healthy 1X by which that of a healthy machine at its speed does not change."""
 _AS_BEFORE = 0.05
 """Part of it within which the machine is as it was."""
+_NEARLY = 0.75
+"""Part of the mildest load from which on a shaft that rests elsewhere is loaded."""
+_NO_MORE = 0.6
+"""The same below which it is no more."""
 _CERTAIN = 6.0
 """Standard deviations of noise that a change of 1X must have to be one by itself."""
 _OFF_ITS_CURVE = 0.25
@@ -211,10 +215,27 @@ class SteadyChange:
         least = _LEAST_CHANGE * orbit + _OFF_ITS_CURVE * swings
         return off > max(least, _CERTAIN * noise * math.sqrt(4.0 / self.samples))
 
-    def is_over(self, healthy: Complexes) -> bool:
-        """Whether 1X is that of the healthy machine again."""
+    def is_load(self, least: float, noise: float) -> bool:
+        """Whether the shaft rests elsewhere by as much as the mildest load moves it, or nearly.
+
+        Probes drift, so how much counts is for who states the loads.
+
+        Args:
+            least: how far that load moves it, in clearances; infinite if none is known.
+            noise: standard deviation of the measured position, in clearances.
+        """
+        by_noise = _CERTAIN * noise * math.sqrt(2.0 / self.samples)
+        return abs(complex(self.moved[2])) > max(_NEARLY * least, by_noise)
+
+    def is_over(self, healthy: Complexes, least: float = math.inf) -> bool:
+        """Whether 1X is that of the healthy machine again, and no load is left.
+
+        Args:
+            healthy: complex128 ``[3]`` or ``[7]``, the healthy mode's.
+            least: how far the mildest load moves the shaft, in clearances.
+        """
         moved, orbit = (float(np.linalg.norm(one[:2])) for one in (self.moved, healthy))
-        return moved < _AS_BEFORE * orbit
+        return moved < _AS_BEFORE * orbit and abs(complex(self.moved[2])) < _NO_MORE * least
 
 
 def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes, noise: float) -> SteadyChange | None:

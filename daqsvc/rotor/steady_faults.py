@@ -113,6 +113,8 @@ class SteadyFaults:
         shifts = (motions - motions[0])[self._faults == "static_load", 2]
         shifts = shifts[np.isfinite(shifts) & (shifts != 0.0)]  # a shaft that may touch and does not has none
         self._load_towards: Complexes = shifts / np.abs(shifts)
+        self.least_load = float(np.min(np.abs(shifts), initial=math.inf))
+        """How far the mildest load mode moves the shaft, in clearances; infinite without one."""
         self._likely: Explanation | None = None
         self._held: Explanation | None = None
         self._judged_samples, self._since = 0, 0

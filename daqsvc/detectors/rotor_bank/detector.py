@@ -492,7 +492,10 @@ class RotorBankDetector:
         certain = (
             change is not None
             and self._at_calibrated_speed
-            and change.is_certain(nearby, self._noise, swings)
+            and (
+                change.is_certain(nearby, self._noise, swings)
+                or change.is_load(self._least_load, self._noise)
+            )
         )
         if not (changed or certain):
             self._change.off = None
@@ -503,7 +506,7 @@ class RotorBankDetector:
         if change is None:
             return
         healthy_like = bank.look_alike(0)
-        if healthy_like[bank.decision] and change.is_over(healthy):
+        if healthy_like[bank.decision] and change.is_over(healthy, self._least_load):
             # The observers would never go back to healthy from a mode that looks like it.
             healthy_like[0] = False
             self._change.off = None
@@ -556,11 +559,17 @@ class RotorBankDetector:
                 off = narrowed(off, faults, likely)
             others = [] if likely is None else sorted(likely.difference(faults.tolist()))
             # No steady motion is compared of a machine that all observers take for the healthy one.
-            off.excluded[0] = change.is_certain(nearby, self._noise)
+            least = math.inf if steady_faults is None else steady_faults.least_load
+            off.excluded[0] = change.is_certain(nearby, self._noise) or change.is_load(least, self._noise)
             together = off.pairs[k] | (bank.look_alike(k) & ~off.excluded)
             names = [faults[k], *faults[together], *others]
             predicted[self._modes[k].name] = tuple(dict.fromkeys(map(str, names)))
         return predicted
+
+    @property
+    def _least_load(self) -> float:
+        """How far the mildest load moves the shaft, from wherever it comes; infinite if it is not judged."""
+        return math.inf if self._steady_faults is None else self._steady_faults.least_load
 
     @property
     def _at_calibrated_speed(self) -> bool:
