@@ -72,6 +72,11 @@ class Explanation:
     evidence: Mapping[str, float] = field(default_factory=dict)
     samples: int = 0
 
+    @property
+    def is_no_mode(self) -> bool:
+        """Whether no mode explains the change: which of them is nearest means nothing then."""
+        return not self.faults
+
 
 class SteadyFaults:
     """Judges steady changes of one machine.

@@ -88,8 +88,8 @@ class _Change:
 
     @property
     def no_mode_explains_it(self) -> bool:
-        """Whether it is none of the modes: then which of them is nearest means nothing."""
-        return self.besides is not None and not self.besides.faults
+        """Whether something else than the modes explains it, and no mode does."""
+        return self.besides is not None and self.besides.is_no_mode
 
 
 class RotorBankDetector:
@@ -468,11 +468,11 @@ class RotorBankDetector:
         """
         found = None if self._steady_faults is None else self._steady_faults.found
         mode = self._bank.decision
-        seen = found is not None and bool(found.others) and (mode != 0 or not found.faults)
+        seen = found is not None and bool(found.others) and (mode != 0 or found.is_no_mode)
         before, now = self._change.besides, found if seen else None
         self._change.besides = now
         stated = self._decision
-        if now is not None and not now.faults:
+        if now is not None and now.is_no_mode:
             self._decision = now.others[0]
         elif stated not in self._faults and mode != UNDETERMINED:
             self._decision = self._modes[mode].name

@@ -115,7 +115,7 @@ class BankDiagnosisBuilder:
             probabilities = self._shared(probabilities, decision, off.pairs[decision])
         chances = dict(zip(names, probabilities.tolist(), strict=True))
         indices, severity = report.group, self.severity(decision, besides)
-        if besides is not None and not besides.faults:
+        if besides is not None and besides.is_no_mode:
             # The evidence of the modes is one for the nearest of them, not for what is stated.
             indices, evidence = (), dict(besides.evidence)
         elif departure is not None and not changed:
@@ -216,7 +216,7 @@ class BankDiagnosisBuilder:
         """
         known = mode != UNDETERMINED and self.rules.rule == "cusum"
         severity = self.modes[mode].severity if known else "normal"
-        outside = besides is not None and not besides.faults
+        outside = besides is not None and besides.is_no_mode
         return "alert" if outside and severity == "normal" else severity
 
 
