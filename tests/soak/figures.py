@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy import stats
 
+from daqsvc.diagnosis.pipeline import THREADS
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -33,15 +35,19 @@ class Census(NamedTuple):
     """What a process has open.
 
     Attributes:
-        threads: of the process.
+        threads: of the process, but for those that compute.
+        computing: threads of a lower priority than the process has. One starts when all others are busy,
+            and one that a call has kept for long ends with it: so there are more of them at times.
         descriptors: what is open how often: files by their names, all sockets alike, and so on.
     """
 
     threads: int
+    computing: int
     descriptors: Counter[str]
 
     def __str__(self) -> str:
-        return f"{self.threads} threads, {self.descriptors.total()} descriptors"
+        threads = f"{self.threads} threads and {self.computing} that compute"
+        return f"{threads}, {self.descriptors.total()} descriptors"
 
     def against(self, before: Census) -> str:
         """What is different, in words; empty if nothing is."""
@@ -49,9 +55,10 @@ class Census(NamedTuple):
             name: (self.descriptors[name], before.descriptors[name])
             for name in sorted(self.descriptors | before.descriptors)
         }
-        return "; ".join(
-            f"{now} of {name}, not {then}" for name, (now, then) in counts.items() if now != then
-        )
+        different = [f"{now} of {name}, not {then}" for name, (now, then) in counts.items() if now != then]
+        if self.computing > THREADS:
+            different.append(f"{self.computing} threads that compute, and {THREADS} at most are to stay")
+        return "; ".join(different)
 
 
 def rss_bytes(pid: int) -> int:
@@ -66,7 +73,16 @@ def census(pid: int) -> Census:
         with contextlib.suppress(FileNotFoundError):  # it has been closed meanwhile
             # Each terminal, pipe and socket has a number of its own, and each new one another.
             open_now[re.sub(r"pts/\d+|:\[\d+\]", "", f"{descriptor.readlink()}")] += 1
-    return Census(len([*(process / "task").iterdir()]), open_now)
+    nices = [nice for task in (process / "task").iterdir() if (nice := _nice(task)) is not None]
+    computing = sum(nice > (_nice(process) or 0) for nice in nices)
+    return Census(len(nices) - computing, computing, open_now)
+
+
+def _nice(task: Path) -> int | None:
+    """How far the priority of a thread is lowered; None if it has ended meanwhile."""
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return int((task / "stat").read_text().rpartition(")")[2].split()[16])
+    return None
 
 
 async def lowest(pid: int) -> Census:
@@ -76,7 +92,7 @@ async def lowest(pid: int) -> Census:
         seen.append(census(pid))
         await asyncio.sleep(0.03)
     least = min((one.descriptors for one in seen), key=Counter.total)
-    return Census(min(one.threads for one in seen), least)
+    return Census(min(one.threads for one in seen), min(one.computing for one in seen), least)
 
 
 def cpu_s(pid: int) -> float:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import os
 import random
+import threading
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,9 +19,11 @@ import pytest
 from soak.alarms import Cycle, Event, Evidence, Turn
 from soak.books import Book, TrendBook
 from soak.devices import MODULUS, Device
-from soak.figures import MIB, Trend
+from soak.figures import MIB, Census, Trend, lowest
 from soak.machines import ALARM
 from soak.run import Soak
+
+from daqsvc.diagnosis.pipeline import NICE, THREADS
 
 SECOND_NS = 4 * 10**9
 COUNTED = {"counter_restarts": 0, "frames_rejected": 0, "frames_set_aside": 0, "frames_late": 0}
@@ -218,6 +223,36 @@ def test_a_device_that_was_not_played_sends_no_more_than_a_second_and_excuses_wh
     device.disturb()
     device.read_to(device.count + 1)
     assert not device.steady, "a wire that is pulled meanwhile is another matter"
+
+
+def test_a_thread_more_is_seen_and_how_many_compute_is_bounded_only() -> None:
+    before = Census(10, 1, Counter({"a.db": 1}))
+    assert before._replace(computing=THREADS).against(before) == ""
+    assert before._replace(computing=0).against(before) == ""
+    assert before._replace(threads=11).against(before) == "11 of threads, not 10"
+    assert before._replace(descriptors=Counter()).against(before) == "0 of a.db, not 1"
+    assert f"{THREADS + 1} threads that compute" in before._replace(computing=THREADS + 1).against(before)
+
+
+async def test_threads_that_compute_are_told_by_their_lower_priority() -> None:
+    over, under_way = threading.Event(), threading.Barrier(4)
+
+    def wait(lower_by: int) -> None:
+        me = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + lower_by)
+        under_way.wait()
+        over.wait()
+
+    before = await lowest(os.getpid())
+    threads = [threading.Thread(target=wait, args=(lower_by,)) for lower_by in (0, NICE, NICE)]
+    for thread in threads:
+        thread.start()
+    under_way.wait()
+    now = await lowest(os.getpid())
+    over.set()
+    for thread in threads:
+        thread.join()
+    assert (now.threads - before.threads, now.computing - before.computing) == (1, 2)
 
 
 async def test_one_thing_that_befalls_it_does_so_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
