@@ -42,7 +42,7 @@ def seen_after(change, seed):
     for revolution in range(HEALTHY.revolutions + 128):
         noise = deviation * (rng.standard_normal(5) + 1j * rng.standard_normal(5))
         shift = change if revolution >= HEALTHY.revolutions else 0.0
-        if test.add(noise + shift, HEALTHY.noise, 0.0).departed:
+        if test.add(noise + shift, HEALTHY.noise, np.zeros(3)).departed:
             return revolution - HEALTHY.revolutions + 1
     return math.inf
 
@@ -104,7 +104,7 @@ def test_the_group_opens_where_no_loss_of_damping_can_do_it():
             revolutions=50,
         )
         change = np.array([0.0, there.baseline[1], 0.0, 0.0, 0.0])
-        variance = there.spread.of_means(50.0, 50.0, 0.0)
+        variance = there.spread.of_means(50.0, 50.0)
         assert (damping_misfit(change, variance, there.healthy) >= 5.0) is open_there
         assert vector_detectability(there, THRESHOLD_NATS).one_group is not open_there
     known = replace(ROTOR, natural_frequency_tolerance=0.01, damping_tolerance=0.05)

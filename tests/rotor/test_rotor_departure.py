@@ -28,8 +28,8 @@ def evidence(revolutions, seed, change=0.0, calibrated=CALIBRATED):
     vectors -= vectors[:calibrated].mean(axis=0)
     test = DepartureTest(SPREAD, threshold_nats=1e9, energy_threshold_nats=1e9, least_reference=calibrated)
     for _ in range(calibrated):
-        test.add(np.zeros(5, dtype=np.complex128), float(noise[:calibrated].mean()), 0.0)
-    evidence = [test.add(vectors[i], float(noise[i]), 0.0) for i in range(calibrated, count)]
+        test.add(np.zeros(5, dtype=np.complex128), float(noise[:calibrated].mean()), np.zeros(3))
+    evidence = [test.add(vectors[i], float(noise[i]), np.zeros(3)) for i in range(calibrated, count)]
     return np.array([e.nats for e in evidence]), np.array([e.energy_nats for e in evidence])
 
 

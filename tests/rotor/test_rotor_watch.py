@@ -156,7 +156,8 @@ def test_a_hunting_speed_teaches_what_the_stated_rotor_does_not_know():
     reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
     assert not any(report.departed for report in reports)
     law = watch.calibration.law
-    assert law.slopes_um[2] == pytest.approx(18.0j, abs=3.0 * law.spread_um[2] + 1.5)
+    spread_um = math.sqrt(law.covariance_um2[2, 0, 0])
+    assert law.follows_um[0, 2] == pytest.approx(18.0j, abs=3.0 * spread_um + 1.5)
     # What was learnt is no licence to move without the speed; of marks that jitter nothing is learnt.
     jitter = 0.01 * np.diff(np.random.default_rng(3).standard_normal(401))
     steady = RotorWatch(ROTOR, RATE_HZ)
@@ -196,7 +197,9 @@ def test_a_stiff_rotor_that_turns_slowly_is_not_late():
     deviation = 0.01 * np.sin(2.0 * math.pi * np.arange(100) / 60.0)
     cut = orbits(np.tile(HEALTHY, (100, 1)), NOISE_UM, 5, deviation=deviation)
     law = calibrate(synchronous_vectors(cut), stiff, RATE_HZ).law
-    assert law.late_um.max() < 1e-3 * NOISE_UM
+    fastest = 0.01 * 2.0 * math.pi / 60.0
+    assert math.sqrt(law.covariance_um2[:, 1, 1].max()) * fastest < 1e-3 * NOISE_UM
+    assert law.off_um.max() == 0.0
 
 
 def test_drift_of_the_probes_is_no_static_load():

@@ -298,7 +298,7 @@ def _innovations(subject: _Subject) -> Figure:
     moved, _ = compensated(
         subject.trace.vectors, calibration.rotor, calibration.speed_rad_s, subject.rate_hz, calibration.law
     )
-    deviation = np.sqrt(calibration.spread.of_means(1.0, float(calibration.revolutions), 0.0))
+    deviation = np.sqrt(calibration.spread.of_means(1.0, float(calibration.revolutions)))
     innovation = np.abs(moved - calibration.baseline) / deviation
     for k, name in enumerate(_COMPONENTS):
         if not (innovation[:, k] > 0.0).any():
@@ -389,7 +389,7 @@ def _polar(subject: _Subject) -> Figure:
     figure.colorbar(drawn, ax=axes, label="revolution", shrink=0.7, pad=0.1)
     calibration = subject.calibration
     baseline = complex(calibration.baseline[1])
-    spread = 2.0 * math.sqrt(float(calibration.spread.of_means(1.0, calibration.revolutions, 0.0)[1]))
+    spread = 2.0 * math.sqrt(float(calibration.spread.of_means(1.0, calibration.revolutions)[1]))
     circle = baseline + spread * np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 121))
     axes.plot(np.angle(circle), np.abs(circle), color=_HEALTHY, linewidth=1.4)
     _arrow(axes, baseline, _HEALTHY)

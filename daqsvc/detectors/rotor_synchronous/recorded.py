@@ -432,12 +432,12 @@ class _Conclusion:
         if not len(recent):
             return {}
         rate_hz = self.recording.rate_hz
-        moved, speed = compensated(
+        moved, terms = compensated(
             recent, calibration.rotor, calibration.speed_rad_s, rate_hz, calibration.law
         )
         change = moved.mean(axis=0) - calibration.baseline
         variance = calibration.spread.of_means(
-            float(len(recent)), calibration.revolutions, float(speed.mean())
+            float(len(recent)), calibration.revolutions, terms.mean(axis=0)
         )
         return likelihoods(change, variance, calibration.healthy, calibration.baseline + change)
 

@@ -326,22 +326,40 @@ class _ComponentTable(_ComplexTable):
 
 _Five = Annotated[list[float], _list("5 numbers", 5)]
 _FiveSizes = Annotated[list[NotNegative], _list("5 numbers", 5)]
+_Covariance = Annotated[
+    list[Annotated[list[float], _list("3 numbers", 3)]], _list("3 rows", 3), AfterValidator(_variances)
+]
 
 
 class _SpeedLawTable(_CalibrationTable):
     slope_re_um: _Five
     slope_im_um: _Five
-    slope_uncertainty_um: _FiveSizes
-    bend_um: _FiveSizes
+    rate_re_um: _Five = [0.0] * 5
+    rate_im_um: _Five = [0.0] * 5
+    square_re_um: _Five = [0.0] * 5
+    square_im_um: _Five = [0.0] * 5
+    covariance_um2: Annotated[list[_Covariance], _list("5 tables", 5)] | None = None
+    off_um: _FiveSizes = [0.0] * 5
+    # Of files of earlier versions, in place of covariance and what is off:
+    slope_uncertainty_um: _FiveSizes = [0.0] * 5
+    bend_um: _FiveSizes = [0.0] * 5
     late_um: _FiveSizes = [0.0] * 5
-    """Not in files of earlier versions."""
 
     def made(self) -> SpeedLaw:
+        rows = (
+            (self.slope_re_um, self.slope_im_um),
+            (self.rate_re_um, self.rate_im_um),
+            (self.square_re_um, self.square_im_um),
+        )
+        if self.covariance_um2 is not None:
+            covariance = np.array(self.covariance_um2)
+        else:
+            covariance = np.zeros((5, 3, 3))
+            covariance[:, 0, 0] = np.square(self.slope_uncertainty_um)
         return SpeedLaw(
-            slopes_um=np.array(self.slope_re_um) + 1j * np.array(self.slope_im_um),
-            spread_um=np.array(self.slope_uncertainty_um),
-            bend_um=np.array(self.bend_um),
-            late_um=np.array(self.late_um),
+            follows_um=np.array([np.array(re) + 1j * np.array(im) for re, im in rows]),
+            covariance_um2=covariance,
+            off_um=np.sqrt(np.sum(np.square([self.off_um, self.bend_um, self.late_um]), axis=0)),
         )
 
 
@@ -584,14 +602,12 @@ def _steady_lines(calibration: Calibration, verdict: str, source: str) -> Iterat
     if calibration.law is not None:
         law = calibration.law
         figures = {
-            "slope_re_um": law.slopes_um.real,
-            "slope_im_um": law.slopes_um.imag,
-            "slope_uncertainty_um": law.spread_um,
-            "bend_um": law.bend_um,
-            "late_um": law.late_um,
-        }
+            f"{name}_{part}_um": getattr(row, whole).tolist()
+            for name, row in zip(("slope", "rate", "square"), law.follows_um, strict=True)
+            for part, whole in (("re", "real"), ("im", "imag"))
+        } | {"covariance_um2": law.covariance_um2.tolist(), "off_um": law.off_um.tolist()}
         yield "# how the components below follow the speed, um for a relative change of 1; the speed hunted"
-        yield f"speed_law = {{ {', '.join(f'{key} = {row.tolist()!r}' for key, row in figures.items())} }}"
+        yield f"speed_law = {{ {', '.join(f'{key} = {row!r}' for key, row in figures.items())} }}"
     eccentricity = calibration.eccentricity_um
     yield f"# unbalance, if this is a Laval rotor: eccentricity {_polar(eccentricity)}"
     for key, value, variance in zip(

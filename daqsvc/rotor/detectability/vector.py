@@ -175,7 +175,7 @@ def vector_detectability(
     drift = math.inf if ac_coupled else probe_drift_um**2
     spread = replace(calibration.spread, drift=drift)
     reference = float(calibration.revolutions)
-    last = spread.of_means(float(WINDOWS[-1]), reference, 0.0)
+    last = spread.of_means(float(WINDOWS[-1]), reference)
     margin = naming_of(calibration.rotor).margin_nats
     misfit = _misfit(calibration, calibration.speed_rpm)
     nearest = sorted(_SPEEDS, key=lambda part: abs(part - 1.0))
@@ -195,7 +195,7 @@ def vector_detectability(
             windows = (
                 float(m)
                 for m in WINDOWS
-                if evidence(change, spread.of_means(float(m), reference, 0.0)) >= threshold_nats
+                if evidence(change, spread.of_means(float(m), reference)) >= threshold_nats
             )
             delays.append(DetectionDelay(kind.quantity(calibration, one), next(windows, None)))
         return VisibleFault(
@@ -296,6 +296,6 @@ def _misfit(calibration: Calibration, speed_rpm: float) -> float:
     baseline = calibration.baseline.copy()
     baseline[FORWARD] = calibration.eccentricity_um * unbalance_response(ratio, rotor.damping_ratio)
     there = replace(calibration, speed_rpm=speed_rpm, baseline=baseline)
-    variance = there.spread.of_means(_SETTLED, float(calibration.revolutions), 0.0)
+    variance = there.spread.of_means(_SETTLED, float(calibration.revolutions))
     change = _only(FORWARD, (_GROWN - 1.0) * baseline[FORWARD])
     return damping_misfit(change, variance, there.healthy)

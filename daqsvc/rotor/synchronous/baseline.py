@@ -19,7 +19,7 @@ from daqsvc.rotor.synchronous.departure import (
     oddest_stretch,
     turn_per_revolution,
 )
-from daqsvc.rotor.synchronous.speed_law import SpeedLaw, learn
+from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS, SpeedLaw, learn, speed_terms
 from daqsvc.rotor.synchronous.vectors import FLOOR, HARMONICS, Healthy
 
 if TYPE_CHECKING:
@@ -197,14 +197,23 @@ def compensated(
     speed_rad_s: float,
     rate_hz: float,
     law: SpeedLaw | None = None,
+    before: Floats | None = None,
 ) -> tuple[Complexes, Floats]:
-    """Vectors with 1X brought to one speed, and each revolution's relative deviation from it.
+    """Vectors with 1X brought to one speed, and how each revolution's speed differs from it.
 
     1X itself moves with the speed; the slope d ln H / d ln Omega of the rotor takes that out to first order,
     and what was learnt of this machine (``law``) the rest.
 
+    Args:
+        vectors: of some revolutions, um.
+        rotor: what is known about it.
+        speed_rad_s: the one speed.
+        rate_hz: sampling rate.
+        law: how the machine follows its speed, where that was learnt.
+        before: float64, deviations of the revolutions before.
+
     Returns:
-        complex128 ``[R, 5]`` and float64 ``[R]``.
+        complex128 ``[R, 5]``, and float64 ``[R, 3]``: `speed_terms`.
     """
     speed = 2.0 * math.pi * rate_hz / vectors.period_samples
     deviation = speed / speed_rad_s - 1.0
@@ -212,9 +221,10 @@ def compensated(
     moved = vectors.vectors.copy()
     moved[:, 1] /= 1.0 + slope * deviation
     moved[:, 2] /= 1.0 + slope.conjugate() * deviation
+    terms = speed_terms(deviation, before)
     if law is not None:
-        moved -= np.outer(deviation, law.slopes_um)
-    return moved, deviation
+        moved -= law.predicted_um(terms)
+    return moved, terms
 
 
 def calibrate(
@@ -239,17 +249,13 @@ def calibrate(
             f"only {count} usable revolutions; a baseline needs {LEAST_REVOLUTIONS}: give a longer recording"
         )
     speed_rad_s = float(2.0 * math.pi * rate_hz / vectors.period_samples.mean())
-    moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz)
+    moved, terms = compensated(vectors, rotor, speed_rad_s, rate_hz)
     samples = float(vectors.samples.mean())
-    law = learn(
-        moved,
-        deviation,
-        np.full(5, float(vectors.noise.mean()) / samples),
-        *rotor.speed_slope(speed_rad_s),
-        settling_rev=1.0 / (2.0 * math.pi * _decay(rotor, speed_rad_s)),
-    )
+    # What the first revolutions owe to the speed before them is not known.
+    known = slice(EARLIER_SPEEDS, None)
+    law = _learnt(moved[known], terms[known], float(vectors.noise.mean()) / samples, rotor, speed_rad_s)
     if law is not None:
-        moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz, law)
+        moved, terms, vectors = (moved - law.predicted_um(terms))[known], terms[known], vectors[known]
     baseline = moved.mean(axis=0)
     amplitude = float(np.sqrt(np.sum(np.abs(baseline[1:]) ** 2)))
     noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
@@ -259,7 +265,7 @@ def calibrate(
     nonstationary = nonstationarity(
         moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
     )
-    _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, law, assumed=angle_assumed)
+    _refuse_unsteady(moved, white, rotor, speed_rad_s, terms, samples, law, assumed=angle_assumed)
     _refuse_nonstationary(nonstationary, samples, 0.0 if angle_assumed else amplitude * math.pi / samples)
     relative = nonstationary / nonstationary.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
@@ -281,6 +287,30 @@ def with_more(calibration: Calibration, baseline: Complexes, revolutions: int) -
     return replace(calibration, baseline=baseline, revolutions=revolutions)
 
 
+def learnt_anew(
+    calibration: Calibration, moved: Complexes, terms: Floats
+) -> tuple[Calibration, Complexes] | None:
+    """The same calibration with what more healthy revolutions teach of how 1X follows the speed.
+
+    Args:
+        calibration: of the first of them.
+        moved: complex128 ``[R, 5]``, vectors of all, um, with only what the stated rotor predicts taken out.
+        terms: float64 ``[R, 3]``, their `speed_terms`.
+
+    Returns:
+        The calibration, and complex128 ``[R, 5]``, the vectors brought to its speed; None where the speed
+        does not hunt.
+    """
+    rotor, speed_rad_s = calibration.rotor, calibration.speed_rad_s
+    white = calibration.noise / calibration.samples_per_rev
+    law = _learnt(moved, terms, white, rotor, speed_rad_s)
+    if law is None:
+        return None
+    steady = moved - law.predicted_um(terms)
+    variance = _long_run_variance(steady, white, _memory(rotor, speed_rad_s))
+    return replace(calibration, law=law, baseline=steady.mean(axis=0), variance=variance), steady
+
+
 def begun_at(calibration: Calibration, vectors: SynchronousVectors, rate_hz: float) -> Calibration:
     """The same calibration with shaft angle zero where these vectors have it.
 
@@ -299,10 +329,15 @@ def begun_at(calibration: Calibration, vectors: SynchronousVectors, rate_hz: flo
     turn = np.exp(1j * phase * np.array(HARMONICS))
     law = calibration.law
     return replace(
-        calibration,
-        baseline=calibration.baseline * turn,
-        law=None if law is None else replace(law, slopes_um=law.slopes_um * turn),
+        calibration, baseline=calibration.baseline * turn, law=None if law is None else law.turned(turn)
     )
+
+
+def _learnt(
+    moved: Complexes, terms: Floats, white: float, rotor: LavalRotor, speed_rad_s: float
+) -> SpeedLaw | None:
+    settling_rev = 1.0 / (2.0 * math.pi * _decay(rotor, speed_rad_s))
+    return learn(moved, terms, np.full(5, white), *rotor.speed_slope(speed_rad_s), settling_rev)
 
 
 def _memory(rotor: LavalRotor, speed_rad_s: float) -> float:
@@ -355,7 +390,7 @@ def _refuse_unsteady(
     white: float,
     rotor: LavalRotor,
     speed_rad_s: float,
-    deviation: Floats,
+    terms: Floats,
     samples: float,
     law: SpeedLaw | None,
     *,
@@ -368,7 +403,7 @@ def _refuse_unsteady(
         white: variance of a component that white noise makes.
         rotor: what is known about the rotor.
         speed_rad_s: mean speed.
-        deviation: float64 ``[R]``, relative deviation of every revolution's speed.
+        terms: float64 ``[R, 3]``, `speed_terms` of every revolution.
         samples: samples in a revolution.
         law: how the vector follows the speed, where that was learnt.
         assumed: whether the angle rests on a stated speed.
@@ -376,9 +411,10 @@ def _refuse_unsteady(
     amplitude = float(np.median(np.abs(moved[:, 1])))
     memory, floor = _memory(rotor, speed_rad_s), (FLOOR * amplitude) ** 2
     _, slope = rotor.speed_slope(speed_rad_s)
-    guard = amplitude * slope * deviation
+    guard = amplitude * slope * terms[:, :1]
     if law is not None:
-        guard, floor = float(law.spread_um.max()) * deviation, floor + float(law.off_um.max()) ** 2
+        guard = terms @ np.linalg.cholesky(law.covariance_um2[1] + 1e-12 * np.eye(3))
+        floor += float(law.off_um.max()) ** 2
     jitter_rad = 0.0 if assumed else _EDGE_SAMPLES * 2.0 * math.pi / samples
     odd = oddest_stretch(moved, white, memory, floor, guard, jitter_rad)
     if odd.nats <= VECTOR_NATS:

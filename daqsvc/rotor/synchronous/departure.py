@@ -93,7 +93,7 @@ class Spread:
         self,
         revolutions: Floats | float,
         reference: Floats | float,
-        speed: Floats | float,
+        terms: Floats | None = None,
         apart: Floats | float = 0.0,
     ) -> Floats:
         """Variance of the difference of two mean vectors, float64 ``[..., 5]``.
@@ -101,16 +101,16 @@ class Spread:
         Args:
             revolutions: in the one mean.
             reference: in the other.
-            speed: relative difference of their speeds.
+            terms: float64 ``[..., 3]``, difference of their `speed_terms`; None if there is none.
             apart: revolutions from the middle of the one to that of the other.
         """
         share = np.asarray(1.0 / np.asarray(revolutions) + 1.0 / np.asarray(reference))[..., np.newaxis]
         variance = self.variance * share + self.floor
+        terms = np.zeros(3) if terms is None else terms
         slope = 0.0 if self.law is not None else self.speed_slope
         if self.law is not None:
-            variance = variance + (self.law.spread_um * np.asarray(speed)[..., np.newaxis]) ** 2
-            variance = variance + self.law.off_um**2
-        guard = (self.amplitude_um * slope * np.asarray(speed)) ** 2
+            variance = variance + self.law.variance_um2(terms)
+        guard = (self.amplitude_um * slope * terms[..., 0]) ** 2
         guard = guard + (self.amplitude_um * self.turn_rad * np.asarray(apart)) ** 2
         variance[..., 1] += guard
         variance[..., 2] += guard
@@ -135,6 +135,21 @@ class DepartureEvidence:
     departed: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Revolutions that others are compared with.
+
+    Attributes:
+        vector: complex128 ``[5]``, their mean synchronous vector, um.
+        terms: float64 ``[3]``, mean of their `speed_terms`.
+        revolutions: how many they are.
+    """
+
+    vector: Complexes
+    terms: Floats
+    revolutions: int
+
+
 class DepartureTest:
     """Compares each revolution with all before.
 
@@ -152,20 +167,20 @@ class DepartureTest:
         self.threshold_nats = threshold_nats
         self.energy_threshold_nats = energy_threshold_nats
         self._least = least_reference
-        # Sums up to each of the last revolutions: Z_k, noise, relative speed.
-        self._sums: NDArray[np.complex128] = np.zeros((_LONGEST + 1, 7), dtype=np.complex128)
+        # Sums up to each of the last revolutions: Z_k, noise, terms of the speed.
+        self._sums: NDArray[np.complex128] = np.zeros((_LONGEST + 1, 9), dtype=np.complex128)
         self._frozen: NDArray[np.complex128] | None = None
         self.count = 0
 
-    def add(self, vector: Complexes, noise: float, speed: float) -> DepartureEvidence:
+    def add(self, vector: Complexes, noise: float, terms: Floats) -> DepartureEvidence:
         """Take in a revolution.
 
         Args:
             vector: complex128 ``[5]``, its synchronous vector in um, 1X compensated for its speed.
             noise: its residual variance.
-            speed: its relative deviation from the speed of calibration.
+            terms: float64 ``[3]``, its `speed_terms`.
         """
-        row = np.append(vector, (noise, speed))
+        row = np.concatenate((vector, (noise,), terms))
         self.count += 1
         last = self.count % (_LONGEST + 1)
         self._sums[last] = self._sums[(self.count - 1) % (_LONGEST + 1)] + row
@@ -184,26 +199,26 @@ class DepartureTest:
         reference = before / length[:, np.newaxis]
         return self._judge(windows, recent, length, reference)
 
-    def look_at(self, vector: Complexes, speed: float, turned_um: float) -> DepartureEvidence:
+    def look_at(self, vector: Complexes, terms: Floats, turned_um: float) -> DepartureEvidence:
         """Compare one revolution with all before, without taking it in: its angle is less exact than theirs.
 
         Args:
             vector: complex128 ``[5]``, its synchronous vector in um, 1X compensated for its speed.
-            speed: its relative deviation from the speed of calibration.
+            terms: float64 ``[3]``, its `speed_terms`.
             turned_um: standard deviation of what its angle leaves uncertain, in um.
         """
-        reference, length = self.reference_before(0)
-        variance = self.spread.of_means(1.0, float(length), speed) + turned_um**2
-        nats = float((np.abs(vector - reference) ** 2 / variance).sum())
+        before = self.reference_before(0)
+        variance = self.spread.of_means(1.0, float(before.revolutions), terms - before.terms)
+        nats = float((np.abs(vector - before.vector) ** 2 / (variance + turned_um**2)).sum())
         return DepartureEvidence(nats, 0.0, 1, departed=nats > self.threshold_nats)
 
     def _judge(
         self, windows: NDArray[np.int64], recent: Complexes, length: Floats, reference: Complexes
     ) -> DepartureEvidence:
         change = recent[:, :5] - reference[:, :5]
-        speed = (recent[:, 6] - reference[:, 6]).real
+        terms = (recent[:, 6:] - reference[:, 6:]).real
         apart = self.count - (windows + length) / 2.0
-        variance = self.spread.of_means(windows.astype(np.float64), length, speed, apart)
+        variance = self.spread.of_means(windows.astype(np.float64), length, terms, apart)
         nats = (np.abs(change) ** 2 / variance).sum(axis=1)
         noise = np.maximum(reference[:, 5].real, 1e-300)
         louder = np.maximum(recent[:, 5].real / noise - 1.0, 0.0)
@@ -216,13 +231,14 @@ class DepartureTest:
             float(nats[best]), float(energy[loudest]), int(window), departed=by_vector or by_energy
         )
 
-    def reference_before(self, window: int) -> tuple[Complexes, int]:
-        """Mean vector of all revolutions before the last ``window`` ones, and how many they are."""
+    def reference_before(self, window: int) -> Reference:
+        """What all revolutions before the last ``window`` ones have in common."""
         before = self._sums[(self.count - window) % (_LONGEST + 1)]
         length = self.count - window
         if self._frozen is not None and length > _MOST_REFERENCE:
             before, length = self._frozen, _MOST_REFERENCE
-        return before[:5] / length, length
+        mean = before / length
+        return Reference(mean[:5], mean[6:].real, length)
 
 
 VECTOR_NATS = 30.0
@@ -296,7 +312,12 @@ def nonstationarity(
 
 
 def oddest_stretch(
-    vectors: Complexes, white: float, memory: float, floor: float, guard: Floats, jitter_rad: float = 0.0
+    vectors: Complexes,
+    white: float,
+    memory: float,
+    floor: float,
+    guard: Complexes | Floats,
+    jitter_rad: float = 0.0,
 ) -> Stretch:
     """The stretch whose mean vector differs most from that of the others.
 
@@ -305,19 +326,19 @@ def oddest_stretch(
         white: variance of a vector's component that white noise makes.
         memory: correlation of the stirred orbit from one revolution to the next.
         floor: um^2 that no difference counts below.
-        guard: float64 ``[R]``, um of 1X that each revolution's speed leaves uncertain, with its sign.
+        guard: ``[R, G]``, um of 1X that each revolution's speed leaves uncertain, for each reason.
         jitter_rad: standard deviation of where a revolution begins.
     """
     neighbours = np.median(np.abs(np.diff(vectors, axis=0)) ** 2, axis=0) / (2.0 * _MEDIAN)
     stirred = np.maximum(neighbours - white, 0.0) / (1.0 - memory)
     variance = white + stirred * (1.0 + memory) / (1.0 - memory)
     variance = variance + (jitter_rad * np.abs(np.array(HARMONICS) * np.median(np.abs(vectors), axis=0))) ** 2
-    columns = np.column_stack((vectors, guard.astype(np.complex128)))
+    columns = np.column_stack((vectors, guard))
     best = Stretch(0, 0, 0.0, "", 0.0)
     for length, starts, inside, outside, share in _stretches(columns):
         change = inside[:, :5] - outside[:, :5]
         allowed = np.tile(variance * share + floor, (len(starts), 1))
-        allowed[:, 1:3] += (np.abs(inside[:, 5] - outside[:, 5]) ** 2)[:, np.newaxis]
+        allowed[:, 1:3] += (np.abs(inside[:, 5:] - outside[:, 5:]) ** 2).sum(axis=1, keepdims=True)
         terms = np.abs(change) ** 2 / allowed
         nats = terms.sum(axis=1)
         at = int(nats.argmax())

@@ -4,17 +4,21 @@ Near a critical speed 1 % of speed moves 1X by a tenth of itself. What the state
 taken out beforehand (`daqsvc.rotor.synchronous.baseline.compensated`). What it does not, because frequency
 and damping are known roughly, or because the machine is no Laval rotor, is a line through the calibration:
 
-    Z_k(Omega) = b_k + s_k (Omega / Omega_0 - 1)
+    Z_k = b_k + s_k v + r_k dv/dn + c_k v^2,    v = Omega / Omega_0 - 1
 
-The rotor is late, by the revolutions that its free motion dies away in: while the speed rises, 1X is not what
-it is at that speed while it falls. A calibration often sees one of the two only, and its line is off by that.
+The rotor is late, by the revolutions n that its free motion dies away in: while the speed rises, 1X is not
+what it is at that speed while it falls. The rate of the speed stands for that. A calibration may have seen
+the speed rise only. Then the line is uncertain by as much as a rotor can be late, and more revolutions teach
+it.
 
-The slopes have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move teaches
-nothing, and the prior stays.
+Slopes and rates have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move
+teaches nothing, and the prior stays. The bend of a resonance is not learnt, only how large it may be: a part
+of a swing fits any.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -33,10 +37,18 @@ _LEAST_HUNTING = 1e-3
 _MOST_JITTER = 0.5
 """Part of its square that may change from one revolution to the next: a shaft hunts slowly, marks jitter."""
 _SMOOTHED_REV = 9
-"""Revolutions that the rate of the speed is taken over."""
+"""Revolutions that the rate of the speed is taken over, and what the line leaves."""
+EARLIER_SPEEDS = _SMOOTHED_REV - 1
+"""Revolutions before the first one that its rate takes."""
+_LEAST_RATE_REV = 3
+"""Revolutions that a rate takes."""
 _LATE = 2.0
 """Revolutions by which a rotor is late, over those that its free motion dies away in: one of the two modes of
 uneven supports is later than the other."""
+_BY_CHANCE = 2.0
+"""Standard deviations that a mean square may be above its expectation by chance."""
+_BEND = 2.0
+"""Of a swing's square: from its mean to its largest value is half of it."""
 _MODEL_DOUBT = 2.0
 """Standard deviation of a slope that no figures of a rotor give, in parts of the one that they give."""
 
@@ -46,31 +58,61 @@ class SpeedLaw:
     """What was learnt.
 
     Attributes:
-        slopes_um: complex128 ``[5]``, s_k: um for a relative change of speed of 1.
-        spread_um: float64 ``[5]``, standard deviation of each.
-        bend_um: float64 ``[5]``, what the line is off by at most within the speeds that it was learnt from.
-        late_um: float64 ``[5]``, what it is off by at most while the speed changes, as the rotor is late;
-            this cancels over whole swings of the speed.
+        follows_um: complex128 ``[3, 5]``, s_k, r_k and c_k: um for each of `speed_terms`; the last is 0.
+        covariance_um2: float64 ``[5, 3, 3]``, of the errors of these.
+        off_um: float64 ``[5]``, what is off for a few revolutions at most; this cancels over whole swings of
+            the speed.
     """
 
-    slopes_um: Complexes
-    spread_um: Floats
-    bend_um: Floats
-    late_um: Floats
+    follows_um: Complexes
+    covariance_um2: Floats
+    off_um: Floats
 
-    @property
-    def off_um(self) -> Floats:
-        """What the line is off by at most, float64 ``[5]``."""
-        return np.hypot(self.bend_um, self.late_um)
+    def predicted_um(self, terms: Floats) -> Complexes:
+        """What the speed moves the vector by, complex128 ``[..., 5]``.
+
+        Args:
+            terms: float64 ``[..., 3]``, `speed_terms`.
+        """
+        return np.asarray(terms @ self.follows_um)
+
+    def variance_um2(self, apart: Floats) -> Floats:
+        """What is uncertain of the difference between revolutions, float64 ``[..., 5]``.
+
+        Args:
+            apart: float64 ``[..., 3]``, difference of their `speed_terms`.
+        """
+        learnt = np.einsum("...i,kij,...j->...k", apart, self.covariance_um2, apart)
+        return np.asarray(learnt + self.off_um**2)
+
+    def turned(self, turns: Complexes) -> SpeedLaw:
+        """The same where each component is turned, complex128 ``[5]``."""
+        return replace(self, follows_um=self.follows_um * turns)
 
     def over_swings(self) -> SpeedLaw:
         """The same of means over whole swings of the speed."""
-        return replace(self, late_um=np.zeros_like(self.late_um))
+        return replace(self, off_um=np.zeros_like(self.off_um))
+
+
+def speed_terms(deviation: Floats, before: Floats | None = None) -> Floats:
+    """What a vector can follow, float64 ``[R, 3]``: relative speed, its change in a revolution, its square.
+
+    Args:
+        deviation: float64 ``[R]``, relative speed of each revolution.
+        before: float64, that of the revolutions before; the last `EARLIER_SPEEDS` count.
+    """
+    known = deviation if before is None else np.concatenate((before[-EARLIER_SPEEDS:], deviation))
+    rates = np.zeros(len(known))
+    for width in range(_LEAST_RATE_REV, min(_SMOOTHED_REV, len(known)) + 1):
+        time = np.arange(width) - (width - 1) / 2.0
+        last = len(known) if width == _SMOOTHED_REV else width
+        rates[width - 1 : last] = np.convolve(known[:last], time[::-1] / (time @ time), mode="valid")
+    return np.column_stack((deviation, rates[len(known) - len(deviation) :], deviation**2))
 
 
 def learn(
     moved: Complexes,
-    deviation: Floats,
+    terms: Floats,
     variance: Floats,
     slope: complex,
     slope_spread: float,
@@ -80,35 +122,68 @@ def learn(
 
     Args:
         moved: complex128 ``[R, 5]``, vectors with what the stated rotor predicts taken out, um.
-        deviation: float64 ``[R]``, relative speed of each revolution.
+        terms: float64 ``[R, 3]``, `speed_terms` of each revolution.
         variance: float64 ``[5]``, variance of one revolution's vector, um^2.
         slope: d ln Z_1 / d ln Omega of the stated rotor.
         slope_spread: standard deviation of it over the rotor's tolerances.
         settling_rev: revolutions in which the free motion of the stated rotor dies away, to 1/e.
     """
-    away = deviation - deviation.mean()
-    hunting, jitter = float((away**2).mean()), float((np.diff(deviation) ** 2).mean()) / 2.0
+    away = terms - terms.mean(axis=0)
+    hunting, jitter = float((away[:, 0] ** 2).mean()), float((np.diff(terms[:, 0]) ** 2).mean()) / 2.0
     if hunting < _LEAST_HUNTING**2 or jitter > _MOST_JITTER * hunting:
         return None
     mean = moved.mean(axis=0)
     whirl = float(np.hypot(abs(mean[FORWARD]), abs(mean[BACKWARD])))
-    prior = np.zeros(len(mean))
-    prior[[FORWARD, BACKWARD]] = whirl * np.hypot(slope_spread, _MODEL_DOUBT * abs(slope))
-    weight = np.divide(variance, prior**2, out=np.full(len(mean), np.inf), where=prior > 0.0)
-    slopes = (away @ (moved - mean)) / ((away**2).sum() + weight)
-    spread = np.sqrt(variance / ((away**2).sum() + weight))
-    turned = np.zeros(len(mean), dtype=np.complex128)
-    turned[[FORWARD, BACKWARD]] = (slope * mean[FORWARD], np.conj(slope) * mean[BACKWARD])
-    steep = np.abs(turned + slopes)
-    furthest = float(np.abs(away).max())
+    most = whirl * np.hypot(slope_spread, _MODEL_DOUBT * abs(slope))
+    late = _LATE * settling_rev
+    steep = np.hypot(most, abs(slope) * whirl)
+    prior = np.array([most, late * steep])
+    follows, covariance = _fitted(moved - mean, away, prior, variance)
+    lasting = _lasting(moved - mean - away @ follows)
+    if np.any(lasting > variance):
+        # What the line does not explain is no noise that the next revolution takes back.
+        follows, covariance = _fitted(moved - mean, away, prior, np.maximum(variance, lasting))
+        lasting = _lasting(moved - mean - away @ follows)
+    turned = slope * mean[FORWARD], np.conj(slope) * mean[BACKWARD]
     # The next term of the series of a resonance is as much smaller as this one is than the whole.
-    bend = (steep * furthest) ** 2 / max(whirl, 1e-12)
-    late = steep * _fastest(away) * _LATE * settling_rev
-    return SpeedLaw(slopes, spread, bend, late)
+    bend = np.abs(follows[0, [FORWARD, BACKWARD]] + turned) ** 2 / max(whirl, 1e-12)
+    # It bends about the mean speed: by the square of what the speed is away from that.
+    square = np.array([-2.0 * float(terms[:, 0].mean()), 0.0, 1.0])
+    covariance[[FORWARD, BACKWARD]] += ((_BEND * bend) ** 2)[:, np.newaxis, np.newaxis] * np.outer(
+        square, square
+    )
+    chance = variance * (1.0 + _BY_CHANCE * math.sqrt(_SMOOTHED_REV / len(moved)))
+    left = np.maximum(lasting - chance, 0.0) * 2.0 / _SMOOTHED_REV
+    # A part of a swing fits what the next one does not; each whole one that was seen makes that rarer.
+    unseen = np.zeros(len(mean))
+    unseen[[FORWARD, BACKWARD]] = late * np.sqrt(bend * whirl) * float(np.abs(terms[:, 1]).max())
+    unseen /= max(1, _whole_swings(away[:, 0])) ** 2
+    return SpeedLaw(follows, covariance, np.sqrt(left + unseen**2))
 
 
-def _fastest(deviation: Floats) -> float:
-    """Largest change of the relative speed in a revolution, without the jitter of the marks."""
-    width = min(_SMOOTHED_REV, len(deviation) // 2)
-    smooth = np.convolve(deviation, np.full(width, 1.0 / width), mode="valid")
-    return float(np.abs(np.diff(smooth)).max())
+def _whole_swings(away: Floats) -> int:
+    """How often the speed has swung up and down."""
+    width = min(_SMOOTHED_REV, len(away) // 2)
+    above = np.convolve(away, np.full(width, 1.0 / width), mode="valid") > 0.0
+    return int(np.count_nonzero(above[1:] != above[:-1])) // 2
+
+
+def _fitted(moved: Complexes, away: Floats, prior: Floats, variance: Floats) -> tuple[Complexes, Floats]:
+    """What 1X follows speed and rate by, complex128 ``[3, 5]``, and the covariance, float64 ``[5, 3, 3]``."""
+    follows = np.zeros((3, moved.shape[1]), dtype=np.complex128)
+    covariance = np.zeros((moved.shape[1], 3, 3))
+    # In parts of the prior: the two are of different size by decades.
+    scaled = away[:, :2] * prior
+    for k in (FORWARD, BACKWARD):
+        inverse = np.linalg.inv(scaled.T @ scaled + variance[k] * np.eye(2))
+        follows[:2, k] = prior * (inverse @ (scaled.T @ moved[:, k]))
+        covariance[k, :2, :2] = variance[k] * inverse * np.outer(prior, prior)
+    return follows, covariance
+
+
+def _lasting(left: Complexes) -> Floats:
+    """Variance of one revolution as it counts in means of a few, float64 ``[5]``, um^2."""
+    width = min(_SMOOTHED_REV, len(left) // 2)
+    sums = np.cumsum(np.vstack((np.zeros((1, left.shape[1])), left)), axis=0)
+    means = (sums[width:] - sums[:-width]) / width
+    return np.asarray(width * (np.abs(means) ** 2).mean(axis=0))

@@ -20,16 +20,19 @@ from daqsvc.rotor.synchronous.baseline import (
     NotCalibratableError,
     calibrate,
     compensated,
+    learnt_anew,
     with_more,
 )
 from daqsvc.rotor.synchronous.departure import (
     DepartureEvidence,
     DepartureTest,
+    Reference,
     Spread,
     nonstationarity,
     threshold_for,
 )
 from daqsvc.rotor.synchronous.signatures import Energy, Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
@@ -60,14 +63,14 @@ class JudgedRevolution:
         revolution: its number.
         vector: complex128 ``[5]``, synchronous vector less the baseline of the calibration, um.
         noise: variance of a sample that does not repeat with the shaft, um^2.
-        speed: relative deviation from the speed of the calibration.
+        terms: float64 ``[3]``, its `speed_terms`.
         thrice: complex128 ``[2]``, 3X forward and backward, um; NaN if not known.
     """
 
     revolution: int
     vector: Complexes
     noise: float
-    speed: float
+    terms: Floats
     thrice: Complexes
 
 
@@ -135,6 +138,14 @@ def _energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy:
     return Energy(excess, excess**2 / scale)
 
 
+def _as_steady(made: Calibration, before: Calibration) -> bool:
+    """Whether a machine scatters no more than it may by what was known; else it may have changed."""
+    allowed = _TWICE**2 * before.variance
+    if before.law is not None:
+        allowed = np.maximum(allowed, before.law.off_um**2)
+    return bool(np.all(made.variance <= allowed))
+
+
 State: TypeAlias = Literal["calibrating", "watching", "departed"]
 
 LOOKS = (3, 5, 8, 12, 20, 30, 50, 80, 120, 220)
@@ -151,6 +162,10 @@ _SEGMENT_THRESHOLD_NATS = 30.0
 """A changed machine is less steady than a healthy one: only clear further changes begin a new segment."""
 _KEPT = 512
 """Revolutions that identification can reach back."""
+_MORE = 1.5
+_TWICE = 2.0
+_MOST_LEARNT = 2000
+"""Healthy revolutions that teach at most how 1X follows the speed."""
 _PLACED_WITHIN = 0.5
 """Samples within which a keyphasor's edge lies while no others place it."""
 _ABRUPT = 4
@@ -235,10 +250,15 @@ class RotorWatch:
         self.revolutions = 0
         self._waiting: list[SynchronousVectors] = []
         self._previous: Complexes = np.empty((0, 5), dtype=np.complex128)
+        self._speeds: Floats = np.empty(0)
         self._rows: deque[JudgedRevolution] = deque(maxlen=_KEPT)
+        # Healthy revolutions of its own calibration and after it, as the stated rotor alone predicts them.
+        self._lessons: list[JudgedRevolution] = []
+        self._next_lesson = 0
         self._segment: list[JudgedRevolution] = []
         self._test: DepartureTest | None = None
         self._healthy: Calibration | None = None
+        self._reference: Reference | None = None
         self._begun, self._middle = 0, 0.0
         self._onset: int | None = None
         self._reference_from = 0
@@ -286,9 +306,10 @@ class RotorWatch:
     def _take(self, one: SynchronousVectors, *, settled: bool) -> WatchReport:
         if self.calibration is None:
             return self._calibrate(one)
-        moved, speed = compensated(
-            one, self.rotor, self.calibration.speed_rad_s, self.rate_hz, self.calibration.law
+        moved, terms = compensated(
+            one, self.rotor, self.calibration.speed_rad_s, self.rate_hz, self.calibration.law, self._speeds
         )
+        self._speeds = np.append(self._speeds, terms[:, 0])[-EARLIER_SPEEDS:]
         nonstationary = float(
             nonstationarity(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0]
         )
@@ -297,7 +318,7 @@ class RotorWatch:
             self.revolutions,
             moved[0] - self.calibration.baseline,
             nonstationary,
-            float(speed[0]),
+            terms[0],
             one.thrice[0],
         )
         self._rows.append(row)
@@ -305,9 +326,9 @@ class RotorWatch:
         evidence = None
         if self._onset is None and not settled:
             turned_um = _PLACED_WITHIN * 2.0 * math.pi / float(one.samples[0]) * self.calibration.amplitude_um
-            evidence = self._test.look_at(row.vector, row.speed, turned_um)
+            evidence = self._test.look_at(row.vector, row.terms, turned_um)
         elif self._tests(row):
-            evidence = self._test.add(row.vector, self._floored(row.noise), row.speed)
+            evidence = self._add(row)
         departed = evidence is not None and evidence.departed
         looked = False
         if departed and evidence is not None:
@@ -322,36 +343,83 @@ class RotorWatch:
                     self._identify(row.revolution, may_name=True)
                     looked = True
             looked = self._maybe_look(row.revolution) or looked
+        elif settled:
+            self._learn(row)
         return self._report(one, evidence, departed=departed, looked=looked)
 
     def _calibrate(self, one: SynchronousVectors) -> WatchReport:
         self._waiting.append(one)
         if len(self._waiting) >= self.rules.calibrate_revolutions and (self.rules.retry or not self.refused):
+            vectors = SynchronousVectors.joined(self._waiting)
             try:
-                made = calibrate(
-                    SynchronousVectors.joined(self._waiting),
-                    self.rotor,
-                    self.rate_hz,
-                    angle_assumed=self.rules.angle_assumed,
-                )
+                made = calibrate(vectors, self.rotor, self.rate_hz, angle_assumed=self.rules.angle_assumed)
             except NotCalibratableError as error:
                 self.refused = str(error)
                 del self._waiting[: max(1, self.rules.calibrate_revolutions // 2)]
             else:
                 self._begin(made)
+                self._learn_first(made, vectors[vectors.usable])
         return self._report(one, None, departed=False, looked=False)
+
+    def _learn_first(self, made: Calibration, vectors: SynchronousVectors) -> None:
+        """Keep what a calibration was made of: later revolutions teach more together with it."""
+        moved, terms = compensated(vectors, made.rotor, made.speed_rad_s, self.rate_hz)
+        first = self.revolutions - len(vectors) + 1
+        self._lessons = [
+            JudgedRevolution(first + i, moved[i], made.noise, terms[i], vectors.thrice[i])
+            for i in range(EARLIER_SPEEDS, len(vectors))
+        ]
+        self._speeds = terms[-EARLIER_SPEEDS:, 0]
+        self._next_lesson = round(_MORE * len(vectors))
+
+    def _learn(self, row: JudgedRevolution) -> None:
+        """Learn anew how 1X follows the speed, each time that half as many revolutions more are known."""
+        assert self.calibration is not None  # noqa: S101 - only called after it was made
+        if not self._lessons or len(self._lessons) >= _MOST_LEARNT:
+            return
+        law = self.calibration.law
+        vector = row.vector + self.calibration.baseline
+        if law is not None:
+            vector = vector + law.predicted_um(row.terms)
+        self._lessons.append(replace(row, vector=vector))
+        if len(self._lessons) < self._next_lesson:
+            return
+        self._next_lesson = round(_MORE * self._next_lesson)
+        moved = np.array([one.vector for one in self._lessons])
+        terms = np.array([one.terms for one in self._lessons])
+        learnt = learnt_anew(self.calibration, moved, terms)
+        if learnt is None or not _as_steady(learnt[0], self.calibration):
+            return
+        made, steady = learnt
+        self.calibration = self._healthy = made
+        rows = [
+            replace(one, vector=vector)
+            for one, vector in zip(self._lessons, steady - made.baseline, strict=True)
+        ]
+        self._test = self._watching_test(made)
+        for one in rows:
+            self._add(one)
+        self._rows = deque(rows, maxlen=_KEPT)
+        self._previous = steady[-2:]
+
+    def _add(self, row: JudgedRevolution) -> DepartureEvidence:
+        assert self._test is not None  # noqa: S101 - made with the calibration
+        return self._test.add(row.vector, self._floored(row.noise), row.terms)
+
+    def _watching_test(self, calibration: Calibration) -> DepartureTest:
+        """The test of a healthy machine."""
+        threshold_nats = threshold_for(self.rules.false_alarms_per_1000_rev)
+        return self._new_test(threshold_nats, least=calibration.revolutions)
 
     def _begin(self, calibration: Calibration) -> None:
         self.calibration = self._healthy = calibration
         self.rotor = calibration.rotor
         self.refused = ""
-        self._test = self._new_test(
-            threshold_for(self.rules.false_alarms_per_1000_rev), least=calibration.revolutions
-        )
+        self._test = self._watching_test(calibration)
         self._begun = self.revolutions - calibration.revolutions
         # The baseline counts as revolutions seen; they are zero in the test's coordinates.
         for _ in range(calibration.revolutions):
-            self._test.add(np.zeros(5, dtype=np.complex128), calibration.noise, 0.0)
+            self._test.add(np.zeros(5, dtype=np.complex128), calibration.noise, np.zeros(3))
         self._waiting.clear()
 
     def _new_test(self, threshold_nats: float, *, least: int) -> DepartureTest:
@@ -387,7 +455,7 @@ class RotorWatch:
             if since + 1 == _SETTLING + _LEAST_SEGMENT:
                 self._test = self._new_test(_SEGMENT_THRESHOLD_NATS, least=_LEAST_SEGMENT)
                 for earlier in self._segment:
-                    self._test.add(earlier.vector, self._floored(earlier.noise), earlier.speed)
+                    self._add(earlier)
             return False
         return True
 
@@ -395,9 +463,12 @@ class RotorWatch:
         assert self._test is not None  # noqa: S101
         assert self.calibration is not None  # noqa: S101
         if self._onset is None:
-            mean, count = self._test.reference_before(window)
-            self._healthy = with_more(self.calibration, self.calibration.baseline + mean, count)
-            self._middle = self._begun + count / 2.0
+            self._lessons = [one for one in self._lessons if one.revolution < onset]
+            before = self._reference = self._test.reference_before(window)
+            self._healthy = with_more(
+                self.calibration, self.calibration.baseline + before.vector, before.revolutions
+            )
+            self._middle = self._begun + before.revolutions / 2.0
             self._thrice = thrice_of([row for row in self._rows if row.revolution < onset])
         self._onset = onset
         # A slow change is seen long after its onset: what came before belongs to the reference of before.
@@ -448,14 +519,16 @@ class RotorWatch:
         if not rows:
             return
         vectors = np.array([row.vector for row in rows])
-        speed = float(np.mean([row.speed for row in rows]))
+        terms = np.mean([row.terms for row in rows], axis=0)
+        if self._reference is not None:
+            terms = terms - self._reference.terms
         shift = self._healthy.baseline - self.calibration.baseline
         change = vectors.mean(axis=0) - shift
         spread = self._spread(self._healthy)
         law = None if spread.law is None else spread.law.over_swings()
         spread = replace(spread, variance=np.maximum(spread.variance, scatter(rows)), law=law)
         apart = float(np.mean([row.revolution for row in rows])) - self._middle
-        variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed, apart)
+        variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), terms, apart)
         # Only the two modes of a run-up show how a force passes through the rotor at three times its speed.
         now = thrice_of(rows) if self._healthy.rotor.two_modes is not None else None
         if now is not None and self._thrice is not None:
