@@ -23,13 +23,12 @@ import numpy as np
 from plants.bench import ONSET_REV, Bench
 from plants.drawn import drawn
 from plants.machines import GEOMETRIES, Condition, Geometry, Model, unbalance_force
-from plants.records import RUNOUT
+from plants.records import REVOLUTIONS, RUNOUT
 from plants.simulate import Contact, Stage, move, run_through
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-REVOLUTIONS = 250
 RUN_UP_FROM, RUN_UP_TO, RUN_UP_STEPS = 0.25, 1.55, 130
 """Speeds of a run-up, in parts of the first critical speed, and the steps that oil films change in."""
 _RUN_UP_REVOLUTIONS = 1500

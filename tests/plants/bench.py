@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     Complexes = NDArray[np.complex128]
 
-ONSET_REV = 90
+ONSET_REV = 300
 _RAMP_STEPS = 16
 _LARGEST_WHIRL_M = 60e-6
 
