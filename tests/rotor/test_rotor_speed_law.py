@@ -1,0 +1,122 @@
+"""How 1X follows the speed of a shaft that hunts: what is learnt, and how sure that is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rotor.test_rotor_watch import NOISE_UM, with_change
+from support.rotor_orbits import HEALTHY, RATE_HZ, ROTOR, SPEED_RAD_S, orbits
+
+from daqsvc.rotor.synchronous.baseline import calibrate
+from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS, learn, speed_terms
+from daqsvc.rotor.synchronous.vectors import FORWARD, synchronous_vectors
+from daqsvc.rotor.synchronous.watch import RotorWatch
+
+DAMPING_RATIO = 0.03
+SLENDER = replace(ROTOR, natural_frequency_hz=SPEED_RAD_S / (2.0 * math.pi), damping_ratio=DAMPING_RATIO)
+
+
+def following(deviation: np.ndarray) -> np.ndarray:
+    """1X of a Laval rotor at its critical speed, over that of a steady speed: its envelope's first order.
+
+    a' = s (a - slope v), with s the pole of the free motion as the shaft sees it.
+    """
+    slope = SLENDER.speed_slope(SLENDER.natural_frequency_rad_s)[0]
+    kept = math.exp(-2.0 * math.pi * DAMPING_RATIO)
+    part = np.zeros(len(deviation), dtype=np.complex128)
+    for n in range(1, len(deviation)):
+        part[n] = kept * part[n - 1] + (1.0 - kept) * slope * deviation[n]
+    return 1.0 + part
+
+
+def hunting(count: int, period: float = 70.0) -> np.ndarray:
+    return 0.01 * np.cos(2.0 * math.pi * np.arange(count) / period)
+
+
+def watched(moved: np.ndarray, deviation: np.ndarray) -> tuple[RotorWatch, list[int]]:
+    """A watch after these revolutions, and at which it said that the machine has changed."""
+    watch = RotorWatch(SLENDER, RATE_HZ)
+    reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
+    return watch, [report.revolution for report in reports if report.departed]
+
+
+def late_whirl(count: int) -> tuple[np.ndarray, np.ndarray]:
+    # The first swings are not kept: a shaft that has always hunted has no begin.
+    deviation = hunting(count + 140)
+    moved = np.tile(HEALTHY, (count, 1))
+    moved[:, FORWARD] *= following(deviation)[140:]
+    return moved, deviation[140:]
+
+
+def test_a_change_that_the_swings_of_1x_hid_is_seen_once_they_are_learnt() -> None:
+    moved, deviation = late_whirl(700)
+    _, departed = watched(moved, deviation)
+    assert departed == []
+    moved[400:, FORWARD] += 0.2 * abs(HEALTHY[FORWARD])
+    watch, departed = watched(moved, deviation)
+    assert departed[0] in range(401, 441)
+    assert "unbalance" in watch.finish().group
+
+
+def test_more_swings_make_it_surer() -> None:
+    moved, deviation = late_whirl(700)
+    doubts = []
+    for count in (90, 200, 400):
+        law = watched(moved[:count], deviation[:count])[0].calibration.law
+        still = np.array([0.0, deviation.max() / 10.0, 0.0])
+        doubts.append(float(law.variance_um2(still)[FORWARD]))
+    assert doubts[0] > 4.0 * doubts[1] > 16.0 * doubts[2]
+
+
+def test_a_change_among_the_lessons_is_not_learnt() -> None:
+    """It comes too early to be seen, beside what one swing leaves uncertain."""
+    moved, deviation = late_whirl(150)
+    healthy = watched(moved[:90], deviation[:90])[0].calibration
+    moved[90:, FORWARD] += 0.2 * abs(HEALTHY[FORWARD])
+    watch, departed = watched(moved, deviation)
+    assert departed == []
+    assert watch.calibration is not None
+    learnt = watch.calibration.baseline[FORWARD]
+    assert learnt == pytest.approx(healthy.baseline[FORWARD], abs=0.5)
+
+
+def test_the_first_revolutions_teach_nothing() -> None:
+    """What they owe to the speed before them is not known."""
+    moved, deviation = late_whirl(60)
+    cut = synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation))
+    moved[:EARLIER_SPEEDS, FORWARD] *= 1.2
+    odd = synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation))
+    laws = [calibrate(one, SLENDER, RATE_HZ).law for one in (cut, odd)]
+    assert laws[0].follows_um == pytest.approx(laws[1].follows_um, rel=0.05, abs=1.0)
+
+
+def test_a_steady_speed_teaches_nothing() -> None:
+    still = np.random.default_rng(4).normal(0.0, 1e-4, 200)
+    moved = np.tile(with_change(), (200, 1))
+    assert learn(moved, speed_terms(still), np.full(5, 0.01), 5.0j, 1.0, 5.0) is None
+
+
+@given(
+    speeds=st.lists(st.floats(-0.05, 0.05), min_size=12, max_size=60),
+    at=st.integers(1, 11),
+)
+def test_terms_come_the_same_one_by_one(speeds: list[float], at: int) -> None:
+    deviation = np.array(speeds)
+    whole = speed_terms(deviation)
+    begin = EARLIER_SPEEDS + at % (len(deviation) - EARLIER_SPEEDS)
+    for n in range(begin, len(deviation)):
+        one = speed_terms(deviation[n : n + 1], deviation[:n])
+        np.testing.assert_allclose(one[0], whole[n], atol=1e-12)
+
+
+@given(rate=st.floats(-1e-3, 1e-3), first=st.floats(-0.01, 0.01))
+def test_the_rate_of_an_even_rise_is_its_slope(rate: float, first: float) -> None:
+    terms = speed_terms(first + rate * np.arange(30))
+    np.testing.assert_allclose(terms[2:, 1], rate, atol=1e-12)
+    np.testing.assert_array_equal(terms[:2, 1], 0.0)
+    np.testing.assert_allclose(terms[:, 2], terms[:, 0] ** 2)
