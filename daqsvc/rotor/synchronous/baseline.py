@@ -287,7 +287,7 @@ def with_more(calibration: Calibration, baseline: Complexes, revolutions: int) -
     return replace(calibration, baseline=baseline, revolutions=revolutions)
 
 
-def learnt_anew(
+def learnt_again(
     calibration: Calibration, moved: Complexes, terms: Floats
 ) -> tuple[Calibration, Complexes] | None:
     """The same calibration with what more healthy revolutions teach of how 1X follows the speed.

@@ -7,7 +7,7 @@ and damping are known roughly, or because the machine is no Laval rotor, is a li
     Z_k = b_k + s_k v + r_k dv/dn + c_k v^2,    v = Omega / Omega_0 - 1
 
 The rotor is late, by the revolutions n that its free motion dies away in: while the speed rises, 1X is not
-what it is at that speed while it falls. The rate of the speed stands for that. A calibration may have seen
+what it is at that speed while it falls. This is the term of the rate. A calibration may have seen
 the speed rise only. Then the line is uncertain by as much as a rotor can be late, and more revolutions teach
 it.
 

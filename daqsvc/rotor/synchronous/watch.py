@@ -20,7 +20,7 @@ from daqsvc.rotor.synchronous.baseline import (
     NotCalibratableError,
     calibrate,
     compensated,
-    learnt_anew,
+    learnt_again,
     with_more,
 )
 from daqsvc.rotor.synchronous.departure import (
@@ -373,7 +373,7 @@ class RotorWatch:
         self._next_lesson = round(_MORE * len(vectors))
 
     def _learn(self, row: JudgedRevolution) -> None:
-        """Learn anew how 1X follows the speed, each time that half as many revolutions more are known."""
+        """Learn again how 1X follows the speed, each time that half as many revolutions more are known."""
         assert self.calibration is not None  # noqa: S101 - only called after it was made
         if not self._lessons or len(self._lessons) >= _MOST_LEARNT:
             return
@@ -387,7 +387,7 @@ class RotorWatch:
         self._next_lesson = round(_MORE * self._next_lesson)
         moved = np.array([one.vector for one in self._lessons])
         terms = np.array([one.terms for one in self._lessons])
-        learnt = learnt_anew(self.calibration, moved, terms)
+        learnt = learnt_again(self.calibration, moved, terms)
         if learnt is None or not _as_steady(learnt[0], self.calibration):
             return
         made, steady = learnt
