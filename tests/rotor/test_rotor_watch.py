@@ -199,7 +199,7 @@ def test_a_stiff_rotor_that_turns_slowly_is_not_late():
     law = calibrate(synchronous_vectors(cut), stiff, RATE_HZ).law
     fastest = 0.01 * 2.0 * math.pi / 60.0
     assert math.sqrt(law.covariance_um2[:, 1, 1].max()) * fastest < 1e-3 * NOISE_UM
-    assert law.off_um.max() == 0.0
+    assert law.off_um.max() < 1e-3 * NOISE_UM
 
 
 def test_drift_of_the_probes_is_no_static_load():
