@@ -101,7 +101,8 @@ class RotorSynchronousDetector:
         name: name of the detector.
         listener: called with every report of the watch and the revolution that it is about, in the
             coordinates of the watch; for plots.
-        keep: called with the baseline that was made of the first revolutions, on the detector's thread.
+        keep: called with the baseline that was made of the first revolutions, and with each that has learnt
+            more of how 1X follows the speed, on the detector's thread.
 
     Raises:
         ValueError: a figure cannot be, or the probes look in nearly the same direction.
@@ -263,11 +264,14 @@ class RotorSynchronousDetector:
         self._verdicts.append(verdict)
         if verdict.quality != "good":
             revolution = revolution.unusable()
-        calibrating = self._watch.calibration is None
+        before = self._watch.calibration
+        calibrating = before is None
         reports = self._watch.evaluate(revolution.vector, revolution.orbit, settled=revolution.settled)
         self._ends.append(self._turns.origin + int(revolution.vector.end_index[0]))
         if calibrating and self._watch.calibration is not None:
             self._look_at_baseline(self._watch.calibration)
+        elif before is not None:
+            self._keep_what_was_learnt(before)
         rejected = calibrating and self._watch.calibration is None and bool(self._refused)
         if self._report is not None:
             self._report = replace(self._report, departed=False, looked=False)
@@ -316,6 +320,12 @@ class RotorSynchronousDetector:
             self.ac_coupled = True
             self._watch = self._new_watch(calibration.rotor, calibration)
         self._watch.revolutions = revolutions
+
+    def _keep_what_was_learnt(self, before: Calibration) -> None:
+        """Keep the baseline if it has learnt more of how 1X follows the speed."""
+        calibration = self._watch.calibration
+        if self._keep is not None and calibration is not None and calibration.law is not before.law:
+            self._keep(calibration)
 
     def _blind(self) -> Diagnosis | None:
         """The statement when no revolution has come out for too long."""

@@ -28,6 +28,7 @@ from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.model import RotorParameters, TwoModes
 from daqsvc.rotor.synchronous.watch import WatchRules
 from sim_hw.plants import rotor as plant
+from sim_hw.plants.rotor import keyphasor_voltage
 
 PER_REV = 64
 RATE_HZ = 1600.0
@@ -91,6 +92,23 @@ def steady():
 def softer():
     """A shaft that loses stiffness: its 1X grows and it sags deeper."""
     return channels((CHANGE_REV, {"stiffness": 0.85}), revolutions=130.0, seed=2)
+
+
+def test_what_a_hunting_speed_teaches_later_is_kept_for_the_next_start():
+    """The kept baseline would else allow for ever what one swing left uncertain."""
+    turns = np.arange(190 * PER_REV) / PER_REV
+    turns += 0.01 * 40.0 / (2.0 * math.pi) * np.sin(2.0 * math.pi * turns / 40.0)
+    angle = 2.0 * math.pi * turns
+    z = 10.0j + 20.0 * np.exp(1j * angle) + 2.0 * np.exp(-1j * angle)
+    noise = np.random.default_rng(2).standard_normal((3, len(z)))
+    volts = keyphasor_voltage(turns) + 0.02 * noise[2]
+    samples = np.column_stack((z.real + noise[0], z.imag + noise[1], volts)).astype(np.float32)
+    kept = []
+    run(detector(keep=kept.append), samples)
+    assert len(kept) == 4  # at about 50, 75, 112 and 168 revolutions
+    doubts = [float(one.law.variance_um2(np.array([0.0, 1e-3, 0.0]))[1]) for one in kept]
+    assert doubts == sorted(doubts, reverse=True)
+    assert doubts[0] > 4.0 * doubts[-1]
 
 
 def test_a_change_is_told_at_once_and_named_when_it_has_settled(grown):
