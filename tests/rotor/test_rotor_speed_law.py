@@ -95,6 +95,17 @@ def test_the_first_revolutions_teach_nothing() -> None:
     assert laws[0].follows_um == pytest.approx(laws[1].follows_um, rel=0.05, abs=1.0)
 
 
+def test_a_recording_without_noise_can_teach() -> None:
+    moved, deviation = late_whirl(90)
+    terms = speed_terms(deviation)
+    law = learn(moved, terms, np.zeros(5), *SLENDER.speed_slope(SPEED_RAD_S), 5.0)
+    assert law is not None
+    assert np.isfinite(law.covariance_um2).all()
+    # Parts of one doubt, whose squares add up to it.
+    whole = law.variance_um2(terms)[:, FORWARD] - law.off_um[FORWARD] ** 2
+    np.testing.assert_allclose((law.doubts_um(terms) ** 2).sum(axis=1), whole, rtol=1e-6)
+
+
 def test_a_steady_speed_teaches_nothing() -> None:
     still = np.random.default_rng(4).normal(0.0, 1e-4, 200)
     moved = np.tile(with_change(), (200, 1))

@@ -413,7 +413,7 @@ def _refuse_unsteady(
     _, slope = rotor.speed_slope(speed_rad_s)
     guard = amplitude * slope * terms[:, :1]
     if law is not None:
-        guard = terms @ np.linalg.cholesky(law.covariance_um2[1] + 1e-12 * np.eye(3))
+        guard = law.doubts_um(terms)
         floor += float(law.off_um.max()) ** 2
     jitter_rad = 0.0 if assumed else _EDGE_SAMPLES * 2.0 * math.pi / samples
     odd = oddest_stretch(moved, white, memory, floor, guard, jitter_rad)

@@ -45,6 +45,8 @@ _LEAST_RATE_REV = 3
 _LATE = 2.0
 """Revolutions by which a rotor is late, over those that its free motion dies away in: one of the two modes of
 uneven supports is later than the other."""
+_LEAST_NOISE = 1e-6
+"""Of the whirl: a recording that was computed may have none."""
 _BY_CHANCE = 2.0
 """Standard deviations that a mean square may be above its expectation by chance."""
 _BEND = 2.0
@@ -84,6 +86,17 @@ class SpeedLaw:
         """
         learnt = np.einsum("...i,kij,...j->...k", apart, self.covariance_um2, apart)
         return np.asarray(learnt + self.off_um**2)
+
+    def doubts_um(self, terms: Floats) -> Floats:
+        """What `variance_um2` allows for but ``off_um``, part by part, float64 ``[R, 3]``: its square root.
+
+        Of 1X forward, the component that follows the speed most.
+
+        Args:
+            terms: float64 ``[R, 3]``, `speed_terms`.
+        """
+        variances, directions = np.linalg.eigh(self.covariance_um2[FORWARD])
+        return np.asarray(terms @ (directions * np.sqrt(np.maximum(variances, 0.0))))
 
     def turned(self, turns: Complexes) -> SpeedLaw:
         """The same where each component is turned, complex128 ``[5]``."""
@@ -134,6 +147,7 @@ def learn(
         return None
     mean = moved.mean(axis=0)
     whirl = float(np.hypot(abs(mean[FORWARD]), abs(mean[BACKWARD])))
+    variance = np.maximum(variance, (_LEAST_NOISE * whirl) ** 2 + 1e-30)
     most = whirl * np.hypot(slope_spread, _MODEL_DOUBT * abs(slope))
     late = _LATE * settling_rev
     steep = np.hypot(most, abs(slope) * whirl)
@@ -149,9 +163,8 @@ def learn(
     bend = np.abs(follows[0, [FORWARD, BACKWARD]] + turned) ** 2 / max(whirl, 1e-12)
     # It bends about the mean speed: by the square of what the speed is away from that.
     square = np.array([-2.0 * float(terms[:, 0].mean()), 0.0, 1.0])
-    covariance[[FORWARD, BACKWARD]] += ((_BEND * bend) ** 2)[:, np.newaxis, np.newaxis] * np.outer(
-        square, square
-    )
+    for k, most_bend in zip((FORWARD, BACKWARD), _BEND * bend, strict=True):
+        covariance[k] += most_bend**2 * np.outer(square, square)
     chance = variance * (1.0 + _BY_CHANCE * math.sqrt(_SMOOTHED_REV / len(moved)))
     left = np.maximum(lasting - chance, 0.0) * 2.0 / _SMOOTHED_REV
     # A part of a swing fits what the next one does not; each whole one that was seen makes that rarer.
