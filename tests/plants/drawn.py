@@ -21,12 +21,13 @@ from plants.machines import Geometry, Journal, Model, Support, stable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-_SEED = 22
+_SEED = 23
 """Of the draw that counts. 17 was evaluated on 2026-11-29; a margin of names was chosen with it in view. 18
 was first evaluated on 2026-11-30; false alarms were corrected and the bank was changed with it in view. 19
 was evaluated on the same day; nothing was changed with it in view, but detectors were changed after it. 20
 was evaluated on the same day; with it in view, records were made longer, and how 1X follows its speed was
-changed. 21 was evaluated after that; with it in view, the threshold of a departure was raised."""
+changed. 21 was evaluated after that; with it in view, the threshold of a departure was raised. 22 with
+that; with it in view, the supports' part in the deflection was left open."""
 _MOST_DRAWS = 200
 
 _ELEMENTS = 10

@@ -8,6 +8,7 @@ states how mean position, forward and backward 1X move together: what fits all t
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,12 @@ _TOLERANCES = np.array([0.1, 0.2, 0.4])
 """How far a change may be from what the modes predict, equally likely."""
 _BESIDE = 0.05
 """The least that such a component is off by, as a part of the largest."""
+_SHARES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6, 0.85)
+"""Parts of the deflection that supports on springs may take, whatever the run-up shows of it."""
+_MOST_LAG = 1.5
+"""c over k of such supports, times the speed: beyond it a damper holds them more than the spring does."""
+_AS_FOUND = 0.5
+"""Probability that the supports' part is the one that the run-up shows."""
 _COMPONENTS = [DC, FORWARD, BACKWARD]
 _GROWS = ((0.4, 0.0), (0.8, 0.0), (1.2, 0.0), (0.8, 0.4), (1.2, 1.2))
 """Powers of the load that stiffness and damping of an oil film grow with. In a short bearing that carries
@@ -58,7 +65,12 @@ def softer(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorPa
     """
     beside = _moved(healthy, rotor, _beside_dampers())
     if not on_film(healthy.rotor):
-        return _likelihood(change, variance, _as_seen(beside, _SEEN))
+        as_found = _likelihood(change, variance, _as_seen(beside, _SEEN))
+        others = [
+            _likelihood(change, variance, _as_seen(_moved(healthy, other, _beside_dampers()), _SEEN))
+            for other in _alike(healthy, rotor)
+        ]
+        return _or_alike(as_found, others)
     # Either the film itself is softer, or what holds it up; the latter has no damper beside it.
     films = _likelihood(change, variance, _as_seen(beside, np.outer(_SEEN, _ASIDE).ravel()))
     pedestals = _likelihood(change, variance, _as_seen(_moved(healthy, rotor, _in_series()), _SEEN))
@@ -118,9 +130,34 @@ def loaded(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorPa
 
 def less_damped(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorParameters) -> float:
     """The same where dampers got weaker."""
-    damping_ratio = rotor.damping_ratio
-    moved = _moved(healthy, rotor, [{"damping_ratio": left * damping_ratio} for left in _LEFT])
-    return _likelihood(change, variance, moved)
+    weaker = [{"damping_ratio": left * rotor.damping_ratio} for left in _LEFT]
+    as_found = _likelihood(change, variance, _moved(healthy, rotor, weaker))
+    if on_film(healthy.rotor):
+        return as_found
+    others = [
+        _likelihood(change, variance, _moved(healthy, other, weaker)) for other in _alike(healthy, rotor)
+    ]
+    return _or_alike(as_found, others)
+
+
+def _alike(healthy: Healthy, rotor: RotorParameters) -> list[RotorParameters]:
+    """Rotors that whirl the same at this speed, with supports that take another part of the deflection."""
+    assert rotor.two_modes is not None  # noqa: S101 - asked for two modes only
+    speed = healthy.speed_rad_s / rotor.natural_frequency_rad_s
+    return [
+        replace(rotor, two_modes=modes, natural_frequency_hz=rotor.natural_frequency_hz * math.sqrt(square))
+        for share in _SHARES
+        for modes, square in rotor.two_modes.alike_at(speed, share)
+        if speed / math.sqrt(square) * modes.support_lag < _MOST_LAG
+    ]
+
+
+def _or_alike(as_found: float, others: list[float]) -> float:
+    """Log likelihood where the rotor may be as it was found, or as well another that whirls the same."""
+    if not others:
+        return as_found
+    alike = log_mean(np.array(others)) + math.log1p(-_AS_FOUND)
+    return float(np.logaddexp(as_found + math.log(_AS_FOUND), alike))
 
 
 def stiffness_left(change: Complexes, healthy: Healthy, rotor: RotorParameters) -> float:
