@@ -288,7 +288,7 @@ class TwoModes:
         higher = self.higher_modes if order else 0j
         return np.asarray(np.linalg.inv(stiffness) + np.diag([higher, higher.conjugate()]))
 
-    def alike_at(self, w: float, support_share: float) -> list[tuple[TwoModes, float]]:
+    def alike_at(self, w: float, over_least: float) -> list[tuple[TwoModes, float]]:
         """Modes that answer the same at one speed, where the supports take another part of the deflection.
 
         A run-up shows the damping well, but hardly whether it is of stiff supports that lag far, or of soft
@@ -296,7 +296,7 @@ class TwoModes:
 
         Args:
             w: normalised speed of the shaft.
-            support_share: the other part, 0 to 1.
+            over_least: the other part over the least that makes as much damping, above 1.
 
         Returns:
             None, one or two, each with the square of its natural frequency over that of this rotor.
@@ -304,16 +304,17 @@ class TwoModes:
         lag = w * self.support_lag
         deflection = 1.0 - self.support_share + self.support_share / (1.0 + 1j * lag)
         lost = -deflection.imag / deflection.real
+        support_share = over_least * 2.0 * lost * (math.hypot(1.0, lost) - lost)
         # lost = share lag / (1 + (1 - share) lag^2) has two solutions: damped more, supports move less.
         root = support_share**2 - 4.0 * lost**2 * (1.0 - support_share)
-        if root < 0.0 or not lost > 0.0:
+        if root < 0.0 or not 0.0 < support_share < 1.0:
             return []
         found = []
         for sign in (-1.0, 1.0):
             other = 2.0 * lost / (support_share - sign * math.sqrt(root))
             square = ((1.0 - support_share + support_share / (1.0 + 1j * other)) / deflection).real
-            turned = square * self.support_share / support_share
-            turned *= ((1.0 + 1j * other) / (1.0 + 1j * lag)) ** 2
+            moved_more = (1.0 + 1j * other) / (1.0 + 1j * lag)
+            turned = square * self.support_share / support_share * moved_more**2
             there = turned * (self.anisotropy + 1j * w * self.damping_anisotropy)
             back = (turned * (self.anisotropy - 1j * w * self.damping_anisotropy).conjugate()).conjugate()
             w_there = w / math.sqrt(square)

@@ -39,8 +39,8 @@ _TOLERANCES = np.array([0.1, 0.2, 0.4])
 """How far a change may be from what the modes predict, equally likely."""
 _BESIDE = 0.05
 """The least that such a component is off by, as a part of the largest."""
-_SHARES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6, 0.85)
-"""Parts of the deflection that supports on springs may take, whatever the run-up shows of it."""
+_SHARES = (1.01, 1.08, 1.2, 1.4, 1.8, 2.5, 4.0)
+"""Parts of the deflection that supports on springs may take, over the least that makes as much damping."""
 _MOST_LAG = 1.5
 """c over k of such supports, times the speed: beyond it a damper holds them more than the spring does."""
 _AS_FOUND = 0.5
@@ -146,8 +146,8 @@ def _alike(healthy: Healthy, rotor: RotorParameters) -> list[RotorParameters]:
     speed = healthy.speed_rad_s / rotor.natural_frequency_rad_s
     return [
         replace(rotor, two_modes=modes, natural_frequency_hz=rotor.natural_frequency_hz * math.sqrt(square))
-        for share in _SHARES
-        for modes, square in rotor.two_modes.alike_at(speed, share)
+        for over_least in _SHARES
+        for modes, square in rotor.two_modes.alike_at(speed, over_least)
         if speed / math.sqrt(square) * modes.support_lag < _MOST_LAG
     ]
 
