@@ -318,7 +318,7 @@ def test_what_is_predicted_is_what_an_exact_machine_would_be_called(machine, own
 def test_what_is_predicted_allows_for_the_error_of_the_model():
     # A little more unbalance in noise is just told from weaker dampers, and not if the model is a little off.
     before = vector_of(MACHINE, SPEED_HZ)
-    grown = vector_of(replace(MACHINE, eccentricity_um=1.15 * MACHINE.eccentricity_um), SPEED_HZ)
-    change = SteadyChange(motion(grown - before), 6400, 24.0 * VARIANCE)
+    grown = vector_of(replace(MACHINE, eccentricity_um=1.1 * MACHINE.eccentricity_um), SPEED_HZ)
+    change = SteadyChange(motion(grown - before), 6400, 12.0 * VARIANCE)
     assert names(judge(before).likely(change)) == {"unbalance"}
     assert judge(before).predicted(change) == {"unbalance", "damping_loss"}

@@ -154,3 +154,54 @@ def test_too_few_revolutions_are_refused():
     vectors = synchronous_vectors(revolutions_of(position, angle))
     with pytest.raises(NotCalibratableError, match="only 10 revolutions"):
         fit_two_modes(vectors[:10], RATE_HZ, natural_frequency_hz=28.0, damping_ratio=0.1)
+
+
+STIFF = Machine(shaft=1.0, supports=(8.0, 8.4), dampers=(7.0, 7.0))
+"""Its supports take a ninth of the deflection, and their dampers are near those that damp most."""
+
+
+@cache
+def alike(speed_hz: float) -> list[RotorParameters]:
+    """What its run-up shows, and rotors that whirl the same at a speed."""
+    known = fitted(*run_up(STIFF, 8.0, 50.0, 25.0))[1].rotor(KNOWN)
+    w = speed_hz / known.natural_frequency_hz
+    others = [
+        replace(known, two_modes=modes, natural_frequency_hz=known.natural_frequency_hz * math.sqrt(square))
+        for over_least in (1.01, 1.08, 1.2, 1.8)
+        for modes, square in known.two_modes.alike_at(w, over_least)
+    ]
+    return [known, *others]
+
+
+@pytest.mark.parametrize("speed_hz", [24.0, 28.0, 33.0])
+def test_rotors_whose_supports_take_another_part_whirl_the_same(speed_hz):
+    known, *others = (rotor.faulty(60.0 * speed_hz) for rotor in alike(speed_hz))
+    assert len(others) == 8
+    for other in others:
+        assert abs(other.orbit() - known.orbit()) < 0.02 * abs(known.orbit())
+        assert abs(other.backward_orbit() - known.backward_orbit()) < 0.02 * abs(known.orbit())
+
+
+@pytest.mark.parametrize("speed_hz", [24.0, 28.0, 33.0])
+@pytest.mark.parametrize("fault", ["weaker dampers", "softer supports"])
+def test_one_of_them_predicts_what_a_fault_does_and_the_run_up_does_not(fault, speed_hz):
+    """Even without noise: what parts them is in the run-up by less than what no model fits."""
+    # Supports of 8 become 4.8, in series with a shaft of 1.
+    static = (1.0 + 1.0 / 8.0) / (1.0 + 1.0 / 4.8)
+    changed = STIFF.damped(0.5) if fault == "weaker dampers" else STIFF.softened(0.6)
+    moved = changed.orbit(speed_hz)[0] - STIFF.orbit(speed_hz)[0]
+    off_by = []
+    for rotor in alike(speed_hz):
+        weak = {"damping_ratio": 0.5 * rotor.damping_ratio}
+        after = rotor.faulty(60.0 * speed_hz, **(weak if "dampers" in fault else {"stiffness_ratio": static}))
+        predicted = KNOWN.clearance_um * (after.orbit() - rotor.faulty(60.0 * speed_hz).orbit())
+        off_by.append(abs(predicted - moved) / abs(moved))
+    assert off_by[0] > 0.5
+    assert min(off_by) < 0.2
+
+
+def test_supports_that_damp_nothing_are_left_as_they_are():
+    known = alike(28.0)[0].two_modes
+    assert replace(known, support_lag=0.0).alike_at(1.0, 1.2) == []
+    # The deflection has no part above its whole.
+    assert known.alike_at(1.0, 1000.0) == []
