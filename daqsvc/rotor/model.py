@@ -299,7 +299,8 @@ class TwoModes:
             over_least: the other part over the least that makes as much damping, above 1.
 
         Returns:
-            None, one or two, each with the square of its natural frequency over that of this rotor.
+            None, one or two, each with the square of its natural frequency over that of this rotor. Their
+            springs and dampers push back in every direction.
         """
         lag = w * self.support_lag
         deflection = 1.0 - self.support_share + self.support_share / (1.0 + 1j * lag)
@@ -327,7 +328,8 @@ class TwoModes:
                 damping_anisotropy=(there - back) / (2j * w_there),
                 higher_modes=self.higher_modes * square,
             )
-            found.append((modes, square))
+            if abs(modes.anisotropy) < 1.0 and abs(modes.damping_anisotropy) < modes.support_lag:
+                found.append((modes, square))
         return found
 
     def _stiffness(
