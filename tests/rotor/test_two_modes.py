@@ -200,6 +200,15 @@ def test_one_of_them_predicts_what_a_fault_does_and_the_run_up_does_not(fault, s
     assert min(off_by) < 0.2
 
 
+def test_no_supports_are_taken_that_drive_the_shaft_in_a_direction():
+    uneven = replace(alike(28.0)[0].two_modes, anisotropy=0.6 + 0j, damping_anisotropy=-0.05 + 0j)
+    found = [modes for over in (1.01, 1.2, 1.8, 4.0) for modes, _ in uneven.alike_at(1.0, over)]
+    assert 0 < len(found) < 8
+    for modes in found:
+        assert abs(modes.anisotropy) < 1.0
+        assert abs(modes.damping_anisotropy) < modes.support_lag
+
+
 def test_supports_that_damp_nothing_are_left_as_they_are():
     known = alike(28.0)[0].two_modes
     assert replace(known, support_lag=0.0).alike_at(1.0, 1.2) == []
