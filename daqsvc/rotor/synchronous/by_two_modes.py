@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -66,11 +67,8 @@ def softer(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorPa
     beside = _moved(healthy, rotor, _beside_dampers())
     if not on_film(healthy.rotor):
         as_found = _likelihood(change, variance, _as_seen(beside, _SEEN))
-        others = [
-            _likelihood(change, variance, _as_seen(_moved(healthy, other, _beside_dampers()), _SEEN))
-            for other in _alike(healthy, rotor)
-        ]
-        return _or_alike(as_found, others)
+        alike = _moved_alike(healthy.baseline.tobytes(), healthy.speed_rad_s, rotor).softer
+        return _or_alike(as_found, [_likelihood(change, variance, _as_seen(moved, _SEEN)) for moved in alike])
     # Either the film itself is softer, or what holds it up; the latter has no damper beside it.
     films = _likelihood(change, variance, _as_seen(beside, np.outer(_SEEN, _ASIDE).ravel()))
     pedestals = _likelihood(change, variance, _as_seen(_moved(healthy, rotor, _in_series()), _SEEN))
@@ -130,20 +128,40 @@ def loaded(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorPa
 
 def less_damped(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorParameters) -> float:
     """The same where dampers got weaker."""
-    weaker = [{"damping_ratio": left * rotor.damping_ratio} for left in _LEFT]
-    as_found = _likelihood(change, variance, _moved(healthy, rotor, weaker))
+    as_found = _likelihood(change, variance, _moved(healthy, rotor, _weaker(rotor)))
     if on_film(healthy.rotor):
         return as_found
-    others = [
-        _likelihood(change, variance, _moved(healthy, other, weaker)) for other in _alike(healthy, rotor)
-    ]
-    return _or_alike(as_found, others)
+    alike = _moved_alike(healthy.baseline.tobytes(), healthy.speed_rad_s, rotor).damped
+    return _or_alike(as_found, [_likelihood(change, variance, moved) for moved in alike])
 
 
-def _alike(healthy: Healthy, rotor: RotorParameters) -> list[RotorParameters]:
+def _weaker(rotor: RotorParameters) -> list[dict[str, Any]]:
+    """Dampers that have lost some of their force."""
+    return [{"damping_ratio": left * rotor.damping_ratio} for left in _LEFT]
+
+
+class _Moved(NamedTuple):
+    """Changes, complex128 ``[n, 3]`` each, of rotors that are alike: by softer springs, by weaker dampers."""
+
+    softer: tuple[Complexes, ...]
+    damped: tuple[Complexes, ...]
+
+
+@lru_cache(maxsize=16)
+def _moved_alike(baseline: bytes, speed_rad_s: float, rotor: RotorParameters) -> _Moved:
+    """What faults do to rotors that are alike; asked for again with every look at a change."""
+    healthy = np.frombuffer(baseline, dtype=np.complex128), speed_rad_s
+    alike = _alike(speed_rad_s, rotor)
+    return _Moved(
+        tuple(_moved_from(*healthy, other, _beside_dampers()) for other in alike),
+        tuple(_moved_from(*healthy, other, _weaker(other)) for other in alike),
+    )
+
+
+def _alike(speed_rad_s: float, rotor: RotorParameters) -> list[RotorParameters]:
     """Rotors that whirl the same at this speed, with supports that take another part of the deflection."""
     assert rotor.two_modes is not None  # noqa: S101 - asked for two modes only
-    speed = healthy.speed_rad_s / rotor.natural_frequency_rad_s
+    speed = speed_rad_s / rotor.natural_frequency_rad_s
     return [
         replace(rotor, two_modes=modes, natural_frequency_hz=rotor.natural_frequency_hz * math.sqrt(square))
         for over_least in _SHARES
@@ -186,9 +204,15 @@ def _moved(healthy: Healthy, rotor: RotorParameters, faults: list[dict[str, Any]
 
     The unbalance is that of the baseline, which need not be that of the run-up.
     """
-    speed_rpm = healthy.speed_rad_s * 30.0 / np.pi
+    return _moved_from(healthy.baseline, healthy.speed_rad_s, rotor, faults)
+
+
+def _moved_from(
+    baseline: Complexes, speed_rad_s: float, rotor: RotorParameters, faults: list[dict[str, Any]]
+) -> Complexes:
+    speed_rpm = speed_rad_s * 30.0 / np.pi
     before = _orbit(rotor.faulty(speed_rpm))
-    balance = healthy.baseline[FORWARD] / before[1]
+    balance = baseline[FORWARD] / before[1]
     change = np.array([_orbit(rotor.faulty(speed_rpm, **fault)) for fault in faults]) - before
     return np.asarray(change * np.array([1.0, balance, balance.conjugate()]))
 
