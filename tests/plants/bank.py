@@ -24,13 +24,13 @@ from plants.score import (
     CLEAR,
     MODELLED,
     ONLY_1X,
-    PER_REV,
     SNR_DB,
     SURE,
     TRUTH,
     keyphasor_volts,
     window_of,
 )
+from plants.timing import ONSET_REV, PER_REV
 
 from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
 from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
@@ -52,8 +52,6 @@ if TYPE_CHECKING:
 
     Case = dict[str, object]
 
-ONSET_REV = 300
-"""That of `plants.bench`, which only where the finite elements are can be imported."""
 _CALIBRATED_REV = 200
 _RULES = DecisionRules(settle_revolutions=4.0)
 _STATOR, _FRICTION = 2.0, 0.1

@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from plants.bench import ONSET_REV, Bench
+from plants.bench import Bench
 from plants.drawn import drawn
 from plants.machines import GEOMETRIES, Condition, Geometry, Model, unbalance_force
-from plants.records import REVOLUTIONS, RUNOUT
+from plants.records import RUNOUT
 from plants.simulate import Contact, Stage, move, run_through
+from plants.timing import ONSET_REV, REVOLUTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

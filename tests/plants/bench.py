@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from plants.machines import Condition, Machine, Model, unbalance_force
 from plants.simulate import Stage
+from plants.timing import ONSET_REV
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 
     Complexes = NDArray[np.complex128]
 
-ONSET_REV = 300
 _RAMP_STEPS = 16
 _LARGEST_WHIRL_M = 60e-6
 

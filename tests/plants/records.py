@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from plants.bench import ONSET_REV, Bench
+from plants.bench import Bench
 from plants.drawn import drawn
 from plants.machines import GEOMETRIES, GRAVITY_M_S2, Geometry, Machine, Model, stable
-from plants.simulate import PER_REV, Contact, Crack, Loose, Motion, Stage, move
+from plants.simulate import Contact, Crack, Loose, Motion, Stage, move
+from plants.timing import ONSET_REV, PER_REV, REVOLUTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
     Complexes = NDArray[np.complex128]
 
-REVOLUTIONS = 700
-"""A quarter of a minute at 3000 rpm. The fault comes at `ONSET_REV`; the healthy ones stay so."""
 RUNOUT = 0.05
 """Of the healthy whirl, in harmonics 1 to 3."""
 DRIFT_UM = 1.0

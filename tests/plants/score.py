@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from plants.run_ups import identified
+from plants.timing import PER_REV
 
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.diagnosis.detector import Window
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from daqsvc.rotor.calibration.two_modes import TwoModeFit
 
 SNR_DB = (20, 10, 0)
-PER_REV = 64
 _TOLERANCE = 0.2
 _KEYPHASOR_WIDTH_RAD = 0.35
 _DRIFT_UM = 1.0

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 import scipy.linalg
+from plants.timing import PER_REV
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Complexes = NDArray[np.complex128]
 
-PER_REV = 64
 _SUBSTEPS = 16
 _SETTLING_REV = 60
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from plants.score import Said, scored
 from plants.table import reliability, summary
+from plants.timing import PER_REV
 
-PER_REV, SPEED_RPM = 64, 3000.0
+SPEED_RPM = 3000.0
 SAID = Said(
     case="a", fault="static load", snr_db=20, moved=0.5, alarms_before=0, revolutions_before=40.0, delay=1.0,
     decision="static_load", group=(), probability=1.0, probabilities={"static_load": 1.0}, evidence={},

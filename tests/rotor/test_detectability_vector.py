@@ -134,7 +134,7 @@ def test_the_command_tells_stated_noise_in_text_and_json(capsys):
     arguments = ["detectability", str(MACHINE), "--noise-um", "1", "--eccentricity-um", "5"]
     assert main(arguments) == 0
     text = capsys.readouterr().out
-    assert "noise 1 um, 50 revolutions of calibration; a change is an alarm at 21.8 nats" in text
+    assert "noise 1 um, 50 revolutions of calibration; a change is an alarm at 21.1 nats" in text
     assert f"one group at 1500 rpm; at {FOUND.opens_at_rpm:.6g} rpm a grown unbalance is told from it" in text
     assert main([*arguments, "--json"]) == 0
     output = fits("daqsvc detectability", json.loads(capsys.readouterr().out, parse_constant=pytest.fail))

@@ -336,8 +336,6 @@ class _SpeedLawTable(_CalibrationTable):
     slope_im_um: _Five
     rate_re_um: _Five = [0.0] * 5
     rate_im_um: _Five = [0.0] * 5
-    square_re_um: _Five = [0.0] * 5
-    square_im_um: _Five = [0.0] * 5
     covariance_um2: Annotated[list[_Covariance], _list("5 tables", 5)] | None = None
     off_um: _FiveSizes = [0.0] * 5
     # Of files of earlier versions, in place of covariance and what is off:
@@ -346,11 +344,7 @@ class _SpeedLawTable(_CalibrationTable):
     late_um: _FiveSizes = [0.0] * 5
 
     def made(self) -> SpeedLaw:
-        rows = (
-            (self.slope_re_um, self.slope_im_um),
-            (self.rate_re_um, self.rate_im_um),
-            (self.square_re_um, self.square_im_um),
-        )
+        rows = (self.slope_re_um, self.slope_im_um), (self.rate_re_um, self.rate_im_um)
         if self.covariance_um2 is not None:
             covariance = np.array(self.covariance_um2)
         else:
@@ -603,7 +597,7 @@ def _steady_lines(calibration: Calibration, verdict: str, source: str) -> Iterat
         law = calibration.law
         figures = {
             f"{name}_{part}_um": getattr(row, whole).tolist()
-            for name, row in zip(("slope", "rate", "square"), law.follows_um, strict=True)
+            for name, row in zip(("slope", "rate"), law.follows_um, strict=True)
             for part, whole in (("re", "real"), ("im", "imag"))
         } | {"covariance_um2": law.covariance_um2.tolist(), "off_um": law.off_um.tolist()}
         yield "# how the components below follow the speed, um for a relative change of 1; the speed hunted"

@@ -45,9 +45,9 @@ _MOST_REFERENCE = 2000
 # and 0.02 departures per 1000 revolutions at 16, 18, 20 and 22 nats; the line is on the safe side of them.
 _RATE_AT_16 = 1.9
 _RATE_PER_NAT = math.log(1.9 / 0.03) / 6.0
-_BESIDE_NOISE = 3.0
+_BESIDE_NOISE = 1.8
 """Departures of a healthy machine over those that noise makes of its vector: its energy is tested, too, its
-probes drift and its speed hunts. Of finite-element rotors there were up to 1.8 times as many as wanted."""
+probes drift and its speed hunts. Of finite-element rotors there were up to so many times as many as wanted."""
 
 
 def threshold_for(false_alarms_per_1000_rev: float) -> float:

@@ -4,7 +4,7 @@ Near a critical speed 1 % of speed moves 1X by a tenth of itself. What the state
 taken out beforehand (`daqsvc.rotor.synchronous.baseline.compensated`). What it does not, because frequency
 and damping are known roughly, or because the machine is no Laval rotor, is a line through the calibration:
 
-    Z_k = b_k + s_k v + r_k dv/dn + c_k v^2,    v = Omega / Omega_0 - 1
+    Z_k = b_k + s_k v + r_k dv/dn,    v = Omega / Omega_0 - 1
 
 The rotor is late, by the revolutions n that its free motion dies away in: while the speed rises, 1X is not
 what it is at that speed while it falls. This is the term of the rate. A calibration may have seen
@@ -12,8 +12,8 @@ the speed rise only. Then the line is uncertain by as much as a rotor can be lat
 it.
 
 Slopes and rates have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move
-teaches nothing, and the prior stays. The bend of a resonance is not learnt, only how large it may be: a part
-of a swing fits any.
+teaches nothing, and the prior stays. The bend of a resonance, a term in v^2, is not learnt: a part of a swing
+fits any. How large it may be is a part of what is uncertain.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class SpeedLaw:
     """What was learnt.
 
     Attributes:
-        follows_um: complex128 ``[3, 5]``, s_k, r_k and c_k: um for each of `speed_terms`; the last is 0.
-        covariance_um2: float64 ``[5, 3, 3]``, of the errors of these.
+        follows_um: complex128 ``[2, 5]``, s_k and r_k: um for each of the first two `speed_terms`.
+        covariance_um2: float64 ``[5, 3, 3]``, of the errors of these and of the bend, for all three.
         off_um: float64 ``[5]``, what is off for a few revolutions at most; this cancels over whole swings of
             the speed.
     """
@@ -76,7 +76,7 @@ class SpeedLaw:
         Args:
             terms: float64 ``[..., 3]``, `speed_terms`.
         """
-        return np.asarray(terms @ self.follows_um)
+        return np.asarray(terms[..., :2] @ self.follows_um)
 
     def variance_um2(self, apart: Floats) -> Floats:
         """What is uncertain of the difference between revolutions, float64 ``[..., 5]``.
@@ -152,12 +152,14 @@ def learn(
     late = _LATE * settling_rev
     steep = np.hypot(most, abs(slope) * whirl)
     prior = np.array([most, late * steep])
-    follows, covariance = _fitted(moved - mean, away, prior, variance)
-    lasting = _lasting(moved - mean - away @ follows)
+    # By speed and rate; the square is about how it bends.
+    line = away[:, :2]
+    follows, covariance = _fitted(moved - mean, line, prior, variance)
+    lasting = _lasting(moved - mean - line @ follows)
     if np.any(lasting > variance):
         # What the line does not explain is no noise that the next revolution takes back.
-        follows, covariance = _fitted(moved - mean, away, prior, np.maximum(variance, lasting))
-        lasting = _lasting(moved - mean - away @ follows)
+        follows, covariance = _fitted(moved - mean, line, prior, np.maximum(variance, lasting))
+        lasting = _lasting(moved - mean - line @ follows)
     turned = slope * mean[FORWARD], np.conj(slope) * mean[BACKWARD]
     # The next term of the series of a resonance is as much smaller as this one is than the whole.
     bend = np.abs(follows[0, [FORWARD, BACKWARD]] + turned) ** 2 / max(whirl, 1e-12)
@@ -181,15 +183,15 @@ def _whole_swings(away: Floats) -> int:
     return int(np.count_nonzero(above[1:] != above[:-1])) // 2
 
 
-def _fitted(moved: Complexes, away: Floats, prior: Floats, variance: Floats) -> tuple[Complexes, Floats]:
-    """What 1X follows speed and rate by, complex128 ``[3, 5]``, and the covariance, float64 ``[5, 3, 3]``."""
-    follows = np.zeros((3, moved.shape[1]), dtype=np.complex128)
+def _fitted(moved: Complexes, line: Floats, prior: Floats, variance: Floats) -> tuple[Complexes, Floats]:
+    """What 1X follows speed and rate by, complex128 ``[2, 5]``, and the covariance, float64 ``[5, 3, 3]``."""
+    follows = np.zeros((2, moved.shape[1]), dtype=np.complex128)
     covariance = np.zeros((moved.shape[1], 3, 3))
     # In parts of the prior: the two are of different size by decades.
-    scaled = away[:, :2] * prior
+    scaled = line * prior
     for k in (FORWARD, BACKWARD):
         inverse = np.linalg.inv(scaled.T @ scaled + variance[k] * np.eye(2))
-        follows[:2, k] = prior * (inverse @ (scaled.T @ moved[:, k]))
+        follows[:, k] = prior * (inverse @ (scaled.T @ moved[:, k]))
         covariance[k, :2, :2] = variance[k] * inverse * np.outer(prior, prior)
     return follows, covariance
 
