@@ -47,7 +47,7 @@ _RATE_AT_16 = 1.9
 _RATE_PER_NAT = math.log(1.9 / 0.03) / 6.0
 _BESIDE_NOISE = 1.8
 """Departures of a healthy machine over those that noise makes of its vector: its energy is tested, too, its
-probes drift and its speed hunts. Of finite-element rotors there were up to so many times as many as wanted."""
+probes drift and its speed hunts. Of finite-element rotors there were up to this many times those wanted."""
 
 
 def threshold_for(false_alarms_per_1000_rev: float) -> float:

@@ -165,7 +165,7 @@ _KEPT = 512
 _MORE = 1.5
 """Healthy revolutions over those at the last time, at which it is learnt again how 1X follows the speed."""
 _TWICE = 2.0
-"""Standard deviation over that of before, above which revolutions are no more those of one healthy machine."""
+"""Standard deviation over that of before, beyond which revolutions are not those of one healthy machine."""
 _MOST_LEARNT = 2000
 """Healthy revolutions that teach at most how 1X follows the speed."""
 _PLACED_WITHIN = 0.5
