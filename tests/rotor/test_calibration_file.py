@@ -48,7 +48,14 @@ rotors = st.builds(
 
 
 sizes = st.lists(positive, min_size=5, max_size=5).map(np.array)
-matrices = st.lists(st.lists(positive, min_size=3, max_size=3), min_size=3, max_size=3)
+thousandths = st.integers(0, 1000).map(lambda n: n / 1000)
+roots = st.lists(st.lists(thousandths, min_size=3, max_size=3), min_size=3, max_size=3).map(np.array)
+# No variance is below 0 in any direction, and those of speed, rate and bend are of different size.
+matrices = st.builds(
+    lambda root, size: np.outer(size, size) * (root @ root.T),
+    roots,
+    st.lists(st.floats(1e-3, 1e3), min_size=3, max_size=3).map(np.array),
+)
 laws = st.builds(
     SpeedLaw,
     follows_um=st.lists(st.lists(complexes, min_size=5, max_size=5), min_size=2, max_size=2).map(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ from daqsvc.rotor.calibration.file import (
     save_calibration,
 )
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.synchronous.baseline import with_rotor
 from daqsvc.rotor.synchronous.watch import WatchRules
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibr
     if not os.path.lexists(path):  # also if it cannot be read: the outbox reports that
         return None
     try:
-        return replace(load_calibration(path, speed_rpm), rotor=rotor)
+        return with_rotor(load_calibration(path, speed_rpm), rotor)
     except CalibrationFileError as error:
         log.warning("the healthy state of the rotor is measured again: %s", error, extra=coded(HEALTHY_STATE))
         return None

@@ -22,13 +22,17 @@ from daqsvc.rotor.calibration.run_up import RunUpFit
 from daqsvc.rotor.calibration.two_modes import TwoModeFit
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.model import TwoModes
-from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE, Calibration
+from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE, Calibration, with_rotor
 from daqsvc.rotor.synchronous.speed_law import SpeedLaw
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from pydantic_core import ErrorDetails
+
+
+_ROUNDED = 1e-9
+"""Part of a covariance that arithmetic leaves."""
 
 
 class CalibrationFileError(ValueError):
@@ -73,7 +77,7 @@ class CalibrationRecord:
 
     def as_watched(self, calibration: Calibration) -> Calibration:
         """A baseline with what the run-up shows of the rotor, as whoever watches by the file has it."""
-        return replace(calibration, rotor=self.with_modes(calibration.rotor, calibration.speed_rpm))
+        return with_rotor(calibration, self.with_modes(calibration.rotor, calibration.speed_rpm))
 
     def at(self, speed_rpm: float | None = None) -> Calibration:
         """The baseline of a speed.
@@ -222,9 +226,13 @@ def _rising(speeds: list[float]) -> list[float]:
 
 
 def _variances(covariance: list[list[float]]) -> list[list[float]]:
-    diagonal = [row[i] for i, row in enumerate(covariance)]
-    if min(diagonal) < 0.0:
-        raise _refused(diagonal, "no variance can be below 0")
+    rows = np.array(covariance)
+    size = np.sqrt(np.maximum(np.abs(np.diag(rows)), np.finfo(float).tiny))
+    scaled = rows / np.outer(size, size)
+    if np.abs(scaled - scaled.T).max() > _ROUNDED:
+        raise _refused(covariance, "give the same numbers in rows and columns")
+    if np.linalg.eigvalsh(scaled).min() < -_ROUNDED:
+        raise _refused(covariance, "no variance can be below 0, in any direction")
     return covariance
 
 
@@ -452,7 +460,7 @@ def load_healthy(
         rotor = replace(rotor, clearance_um=clearance_um)
     rotor = replace(rotor, plain_bearings=plain_bearings)
     rotor = record.with_modes(rotor, speed_rpm)
-    return rotor, tuple(replace(baseline, rotor=rotor) for baseline in baselines)
+    return rotor, tuple(with_rotor(baseline, rotor) for baseline in baselines)
 
 
 def load_record(path: Path | str) -> CalibrationRecord:
@@ -600,7 +608,8 @@ def _steady_lines(calibration: Calibration, verdict: str, source: str) -> Iterat
             for name, row in zip(("slope", "rate"), law.follows_um, strict=True)
             for part, whole in (("re", "real"), ("im", "imag"))
         } | {"covariance_um2": law.covariance_um2.tolist(), "off_um": law.off_um.tolist()}
-        yield "# how the components below follow the speed, um for a relative change of 1; the speed hunted"
+        yield "# how the components below follow the speed, which hunted: um for a relative speed of 1,"
+        yield "# and um for a change of it by 1 in a revolution"
         yield f"speed_law = {{ {', '.join(f'{key} = {row!r}' for key, row in figures.items())} }}"
     eccentricity = calibration.eccentricity_um
     yield f"# unbalance, if this is a Laval rotor: eccentricity {_polar(eccentricity)}"

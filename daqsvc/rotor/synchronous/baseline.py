@@ -17,10 +17,11 @@ from daqsvc.rotor.synchronous.departure import (
     least_stationary_stretch,
     nonstationarity,
     oddest_stretch,
+    threshold_for,
     turn_per_revolution,
 )
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS, SpeedLaw, learn, speed_terms
-from daqsvc.rotor.synchronous.vectors import FLOOR, HARMONICS, Healthy
+from daqsvc.rotor.synchronous.vectors import BACKWARD, FLOOR, FORWARD, HARMONICS, Healthy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,8 +35,6 @@ LEAST_REVOLUTIONS = 20
 SPEED_TOLERANCE = 0.05
 """A baseline holds for speeds that differ by no more than this part: beyond, 1X itself differs."""
 
-_VISIBLE_NATS = 20.0
-"""Departure of about one false alarm in 10,000 revolutions."""
 _NOISE_FLOOR = 1e-3
 """The same of the residual: rounding of the recording."""
 _EDGE_SAMPLES = 0.29
@@ -153,7 +152,7 @@ class Calibration:
     @property
     def smallest_change_um(self) -> float:
         """The smallest change of a component that can be seen, at one false alarm in 10,000 revolutions."""
-        return math.sqrt(_VISIBLE_NATS * float(self.variance.mean()) / self.revolutions)
+        return math.sqrt(threshold_for(0.1) * float(self.variance.mean()) / self.revolutions)
 
     def describe(self) -> str:
         """The verdict in words: what the model of this machine can and cannot separate."""
@@ -191,6 +190,11 @@ class Calibration:
         return "; ".join(sentences)
 
 
+def deviation_of(vectors: SynchronousVectors, speed_rad_s: float, rate_hz: float) -> Floats:
+    """By what part of it each revolution's speed is off this one, float64 ``[R]``."""
+    return np.asarray(2.0 * math.pi * rate_hz / vectors.period_samples / speed_rad_s - 1.0)
+
+
 def compensated(
     vectors: SynchronousVectors,
     rotor: LavalRotor,
@@ -215,8 +219,7 @@ def compensated(
     Returns:
         complex128 ``[R, 5]``, and float64 ``[R, 3]``: `speed_terms`.
     """
-    speed = 2.0 * math.pi * rate_hz / vectors.period_samples
-    deviation = speed / speed_rad_s - 1.0
+    deviation = deviation_of(vectors, speed_rad_s, rate_hz)
     slope, _ = rotor.speed_slope(speed_rad_s)
     moved = vectors.vectors.copy()
     moved[:, 1] /= 1.0 + slope * deviation
@@ -288,14 +291,17 @@ def with_more(calibration: Calibration, baseline: Complexes, revolutions: int) -
 
 
 def learnt_again(
-    calibration: Calibration, moved: Complexes, terms: Floats
+    calibration: Calibration, moved: Complexes, terms: Floats, of_baseline: Floats
 ) -> tuple[Calibration, Complexes] | None:
     """The same calibration with what more healthy revolutions teach of how 1X follows the speed.
 
+    The baseline stays that of its own revolutions: what has grown slowly since then is a change.
+
     Args:
-        calibration: of the first of them.
+        calibration: what was known before.
         moved: complex128 ``[R, 5]``, vectors of all, um, with only what the stated rotor predicts taken out.
         terms: float64 ``[R, 3]``, their `speed_terms`.
+        of_baseline: float64 ``[3]``, mean `speed_terms` of the revolutions that made the baseline.
 
     Returns:
         The calibration, and complex128 ``[R, 5]``, the vectors brought to its speed; None where the speed
@@ -308,7 +314,30 @@ def learnt_again(
         return None
     steady = moved - law.predicted_um(terms)
     variance = _long_run_variance(steady, white, _memory(rotor, speed_rad_s))
-    return replace(calibration, law=law, baseline=steady.mean(axis=0), variance=variance), steady
+    baseline = calibration.baseline - law.predicted_um(of_baseline)
+    if calibration.law is not None:
+        baseline = baseline + calibration.law.predicted_um(of_baseline)
+    return replace(calibration, law=law, baseline=baseline, variance=variance), steady
+
+
+def with_rotor(calibration: Calibration, rotor: LavalRotor) -> Calibration:
+    """The same calibration where other figures of the rotor are stated.
+
+    A law is what these figures leave unexplained: what they explain now that they did not, it has no more.
+
+    Args:
+        calibration: the healthy machine.
+        rotor: what is known about it now.
+    """
+    law = calibration.law
+    if law is not None:
+        was, _ = calibration.rotor.speed_slope(calibration.speed_rad_s)
+        now, _ = rotor.speed_slope(calibration.speed_rad_s)
+        follows = law.follows_um.copy()
+        follows[0, FORWARD] += (was - now) * calibration.baseline[FORWARD]
+        follows[0, BACKWARD] += (was - now).conjugate() * calibration.baseline[BACKWARD]
+        law = replace(law, follows_um=follows)
+    return replace(calibration, rotor=rotor, law=law)
 
 
 def begun_at(calibration: Calibration, vectors: SynchronousVectors, rate_hz: float) -> Calibration:

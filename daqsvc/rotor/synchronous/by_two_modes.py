@@ -46,6 +46,8 @@ _MOST_LAG = 1.5
 """c over k of such supports, times the speed: beyond it a damper holds them more than the spring does."""
 _AS_FOUND = 0.5
 """Probability that the supports' part is the one that the run-up shows."""
+_AS_WELL = 0.01
+"""Part of 1X by which a rotor may explain a change worse than the best one, and count as well."""
 _COMPONENTS = [DC, FORWARD, BACKWARD]
 _GROWS = ((0.4, 0.0), (0.8, 0.0), (1.2, 0.0), (0.8, 0.4), (1.2, 1.2))
 """Powers of the load that stiffness and damping of an oil film grow with. In a short bearing that carries
@@ -180,15 +182,36 @@ def _or_alike(as_found: float, others: list[float]) -> float:
 
 def stiffness_left(change: Complexes, healthy: Healthy, rotor: RotorParameters) -> float:
     """Part of the static stiffness that explains a change best; see `softer`."""
-    losses = _beside_dampers() + (_in_series() if on_film(healthy.rotor) else [])
-    best = int(_misfit(change, _moved(healthy, rotor, losses)).argmin())
-    return float(1.0 / (1.0 + _LOSSES[best % len(_LOSSES)]))
+    ways = [_moved(healthy, rotor, _beside_dampers())]
+    if on_film(healthy.rotor):
+        ways.append(_moved(healthy, rotor, _in_series()))
+    else:
+        ways += _moved_alike(healthy.baseline.tobytes(), healthy.speed_rad_s, rotor).softer
+    return _left(change, healthy, ways, 1.0 / (1.0 + _LOSSES))
 
 
 def damping_left(change: Complexes, healthy: Healthy, rotor: RotorParameters) -> float:
-    """Part of the damping that explains a change best."""
-    moved = _moved(healthy, rotor, [{"damping_ratio": left * rotor.damping_ratio} for left in _LEFT])
-    return float(_LEFT[_misfit(change, moved).argmin()])
+    """Part of the damping that explains a change best; see `less_damped`."""
+    ways = [_moved(healthy, rotor, _weaker(rotor))]
+    if not on_film(healthy.rotor):
+        ways += _moved_alike(healthy.baseline.tobytes(), healthy.speed_rad_s, rotor).damped
+    return _left(change, healthy, ways, _LEFT)
+
+
+def _left(change: Complexes, healthy: Healthy, ways: list[Complexes], left: Floats) -> float:
+    """What is left by the rotors that explain a change best; the median where several do as well.
+
+    Args:
+        change: complex128 ``[5]``, um.
+        healthy: the machine before.
+        ways: complex128 ``[n, 3]`` each, changes that one rotor predicts, for all that may be left in turn.
+        left: float64, what may be left.
+    """
+    misfits = [np.sqrt(_misfit(change, moved)) for moved in ways]
+    best = np.array([misfit.min() for misfit in misfits])
+    fitted = np.array([left[misfit.argmin() % len(left)] for misfit in misfits])
+    whirl = float(np.abs(healthy.baseline[[FORWARD, BACKWARD]] + change[[FORWARD, BACKWARD]]).max())
+    return float(np.median(fitted[best <= best.min() + _AS_WELL * whirl]))
 
 
 def _misfit(change: Complexes, moved: Complexes) -> Floats:

@@ -6,14 +6,14 @@ and damping are known roughly, or because the machine is no Laval rotor, is a li
 
     Z_k = b_k + s_k v + r_k dv/dn,    v = Omega / Omega_0 - 1
 
-The rotor is late, by the revolutions n that its free motion dies away in: while the speed rises, 1X is not
-what it is at that speed while it falls. This is the term of the rate. A calibration may have seen
-the speed rise only. Then the line is uncertain by as much as a rotor can be late, and more revolutions teach
-it.
+with n counted in revolutions. The term of the rate is there because a rotor is late: while the speed rises,
+1X is not what it is at that speed while it falls. It is late by about as many revolutions as its free motion
+takes to die away. A calibration may have seen the speed rise only. Then the line is uncertain by as much as a
+rotor can be late, and more revolutions teach it.
 
-Slopes and rates have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move
-teaches nothing, and the prior stays. The bend of a resonance, a term in v^2, is not learnt: a part of a swing
-fits any. How large it may be is a part of what is uncertain.
+Slopes and rates have a prior: what the rotor's tolerances allow, and as much again as twice its own slope. A
+speed that does not move teaches nothing, and the prior stays. The bend of a resonance, a term in v^2, is not
+learnt: a part of a swing fits any. How large it may be is a part of what is uncertain.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LEAST_HUNTING = 1e-3
 _MOST_JITTER = 0.5
 """Part of its square that may change from one revolution to the next: a shaft hunts slowly, marks jitter."""
 _SMOOTHED_REV = 9
-"""Revolutions that the rate of the speed is taken over, and what the line leaves."""
+"""Revolutions that the rate of the speed is taken over, and that residuals of the line are averaged over."""
 EARLIER_SPEEDS = _SMOOTHED_REV - 1
 """Revolutions before the first one that its rate takes."""
 _LEAST_RATE_REV = 3
@@ -60,8 +60,10 @@ class SpeedLaw:
     """What was learnt.
 
     Attributes:
-        follows_um: complex128 ``[2, 5]``, s_k and r_k: um for each of the first two `speed_terms`.
-        covariance_um2: float64 ``[5, 3, 3]``, of the errors of these and of the bend, for all three.
+        follows_um: complex128 ``[2, 5]``, s_k in um for a relative speed of 1, and r_k in um for a change of
+            it by 1 in a revolution: the first two `speed_terms`.
+        covariance_um2: float64 ``[5, 3, 3]``, of the errors of these and of the bend, um^2 for a product of
+            two `speed_terms` of 1.
         off_um: float64 ``[5]``, what is off for a few revolutions at most; this cancels over whole swings of
             the speed.
     """

@@ -20,6 +20,7 @@ from daqsvc.rotor.synchronous.baseline import (
     NotCalibratableError,
     calibrate,
     compensated,
+    deviation_of,
     learnt_again,
     with_more,
 )
@@ -34,7 +35,7 @@ from daqsvc.rotor.synchronous.departure import (
 from daqsvc.rotor.synchronous.signatures import Energy, Identification, NamingRules, identify
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
-from daqsvc.rotor.synchronous.vectors import SynchronousVectors
+from daqsvc.rotor.synchronous.vectors import FORWARD, SynchronousVectors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -138,12 +139,23 @@ def _energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy:
     return Energy(excess, excess**2 / scale)
 
 
-def _as_steady(made: Calibration, before: Calibration) -> bool:
-    """Whether a machine scatters no more than it may by what was known; else it may have changed."""
-    allowed = _TWICE**2 * before.variance
-    if before.law is not None:
-        allowed = np.maximum(allowed, before.law.off_um**2)
-    return bool(np.all(made.variance <= allowed))
+def _as_steady(made: Calibration, first: Calibration) -> bool:
+    """Whether a machine scatters as it did at first. One that scatters more has changed, or does slowly."""
+    allowed = _TWICE**2 * first.variance
+    if first.law is not None:
+        allowed = np.maximum(allowed, (_A_LITTLE * first.law.off_um) ** 2)
+    off = 0.0 if made.law is None else made.law.off_um**2
+    return bool(np.all(np.maximum(made.variance, off) <= allowed))
+
+
+def _surer(made: Calibration, before: Calibration, terms: Floats) -> bool:
+    """Whether a law leaves less uncertain than that of before, at these `speed_terms`, float64 ``[R, 3]``."""
+    apart = terms - terms.mean(axis=0)
+    doubts = [
+        0.0 if one.law is None else float(one.law.variance_um2(apart)[:, FORWARD].mean())
+        for one in (made, before)
+    ]
+    return doubts[0] < doubts[1]
 
 
 State: TypeAlias = Literal["calibrating", "watching", "departed"]
@@ -165,7 +177,9 @@ _KEPT = 512
 _MORE = 1.5
 """Healthy revolutions over those at the last time, at which it is learnt again how 1X follows the speed."""
 _TWICE = 2.0
-"""Standard deviation over that of before, beyond which revolutions are not those of one healthy machine."""
+"""Standard deviation over that at first, beyond which revolutions are not those of one healthy machine."""
+_A_LITTLE = 1.2
+"""The same of what their speed leaves unexplained. A fault that grows slowly does that, too."""
 _MOST_LEARNT = 2000
 """Healthy revolutions that teach at most how 1X follows the speed."""
 _PLACED_WITHIN = 0.5
@@ -254,9 +268,14 @@ class RotorWatch:
         self._previous: Complexes = np.empty((0, 5), dtype=np.complex128)
         self._speeds: Floats = np.empty(0)
         self._rows: deque[JudgedRevolution] = deque(maxlen=_KEPT)
-        # Healthy revolutions of its own calibration and after it, as the stated rotor alone predicts them.
+        # Healthy revolutions, as the stated rotor alone predicts them. The baseline is of the first of them,
+        # or of none, where it was kept from before.
         self._lessons: list[JudgedRevolution] = []
-        self._next_lesson = 0
+        self._of_baseline = 0
+        self._baseline_terms: Floats = np.zeros(3)
+        self._next_lesson = round(_MORE * self.rules.calibrate_revolutions)
+        self._first = calibration
+        self._kept_law = calibration is not None and calibration.law is not None
         self._segment: list[JudgedRevolution] = []
         self._test: DepartureTest | None = None
         self._healthy: Calibration | None = None
@@ -303,7 +322,17 @@ class RotorWatch:
                 self._orbits.add(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z)
             if one.usable[0]:
                 reports.append(self._take(one, settled=settled))
+            else:
+                self._pass_over(one, settled=settled)
         return reports
+
+    def _pass_over(self, one: SynchronousVectors, *, settled: bool) -> None:
+        """Keep the speed of a revolution that nothing else is known of, for the rate of the next ones."""
+        deviation = np.empty(0)
+        if self.calibration is not None and settled:
+            deviation = deviation_of(one, self.calibration.speed_rad_s, self.rate_hz)
+        known = np.isfinite(deviation).all() and len(deviation)
+        self._speeds = np.append(self._speeds, deviation)[-EARLIER_SPEEDS:] if known else np.empty(0)
 
     def _take(self, one: SynchronousVectors, *, settled: bool) -> WatchReport:
         if self.calibration is None:
@@ -311,6 +340,7 @@ class RotorWatch:
         moved, terms = compensated(
             one, self.rotor, self.calibration.speed_rad_s, self.rate_hz, self.calibration.law, self._speeds
         )
+        rate_known = len(self._speeds) == EARLIER_SPEEDS
         self._speeds = np.append(self._speeds, terms[:, 0])[-EARLIER_SPEEDS:]
         nonstationary = float(
             nonstationarity(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0]
@@ -326,7 +356,9 @@ class RotorWatch:
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
         evidence = None
-        if self._onset is None and not settled:
+        if self._onset is None and self.calibration.law is not None and not rate_known:
+            pass  # By how much 1X is late is not known.
+        elif self._onset is None and not settled:
             turned_um = _PLACED_WITHIN * 2.0 * math.pi / float(one.samples[0]) * self.calibration.amplitude_um
             evidence = self._test.look_at(row.vector, row.terms, turned_um)
         elif self._tests(row):
@@ -345,7 +377,7 @@ class RotorWatch:
                     self._identify(row.revolution, may_name=True)
                     looked = True
             looked = self._maybe_look(row.revolution) or looked
-        elif settled:
+        elif settled and rate_known:
             self._learn(row)
         return self._report(one, evidence, departed=departed, looked=looked)
 
@@ -359,8 +391,8 @@ class RotorWatch:
                 self.refused = str(error)
                 del self._waiting[: max(1, self.rules.calibrate_revolutions // 2)]
             else:
-                self._begin(made)
                 self._learn_first(made, vectors[vectors.usable])
+                self._begin(made)
         return self._report(one, None, departed=False, looked=False)
 
     def _learn_first(self, made: Calibration, vectors: SynchronousVectors) -> None:
@@ -371,13 +403,16 @@ class RotorWatch:
             JudgedRevolution(first + i, moved[i], made.noise, terms[i], vectors.thrice[i])
             for i in range(EARLIER_SPEEDS, len(vectors))
         ]
+        self._of_baseline = len(self._lessons)
+        self._baseline_terms = terms[EARLIER_SPEEDS:].mean(axis=0)
         self._speeds = terms[-EARLIER_SPEEDS:, 0]
-        self._next_lesson = round(_MORE * len(vectors))
+        self._first = made
 
     def _learn(self, row: JudgedRevolution) -> None:
         """Learn again how 1X follows the speed, each time that half as many revolutions more are known."""
         assert self.calibration is not None  # noqa: S101 - only called after it was made
-        if not self._lessons or len(self._lessons) >= _MOST_LEARNT:
+        assert self._first is not None  # noqa: S101 - as above
+        if len(self._lessons) >= _MOST_LEARNT:
             return
         law = self.calibration.law
         vector = row.vector + self.calibration.baseline
@@ -389,17 +424,19 @@ class RotorWatch:
         self._next_lesson = round(_MORE * self._next_lesson)
         moved = np.array([one.vector for one in self._lessons])
         terms = np.array([one.terms for one in self._lessons])
-        learnt = learnt_again(self.calibration, moved, terms)
-        if learnt is None or not _as_steady(learnt[0], self.calibration):
+        learnt = learnt_again(self.calibration, moved, terms, self._baseline_terms)
+        if learnt is None or not _as_steady(learnt[0], self._first):
             return
         made, steady = learnt
+        if self._kept_law and not _surer(made, self.calibration, terms):
+            return
         self.calibration = self._healthy = made
         rows = [
             replace(one, vector=vector)
             for one, vector in zip(self._lessons, steady - made.baseline, strict=True)
         ]
-        self._test = self._watching_test(made)
-        for one in rows:
+        self._test = self._begun_test(made)
+        for one in rows[self._of_baseline :]:
             self._add(one)
         self._rows = deque(rows, maxlen=_KEPT)
         self._previous = steady[-2:]
@@ -408,20 +445,21 @@ class RotorWatch:
         assert self._test is not None  # noqa: S101 - made with the calibration
         return self._test.add(row.vector, self._floored(row.noise), row.terms)
 
-    def _watching_test(self, calibration: Calibration) -> DepartureTest:
-        """The test of a healthy machine."""
+    def _begun_test(self, calibration: Calibration) -> DepartureTest:
+        """The test of a healthy machine, after the revolutions that its baseline is made of."""
         threshold_nats = threshold_for(self.rules.false_alarms_per_1000_rev)
-        return self._new_test(threshold_nats, least=calibration.revolutions)
+        test = self._new_test(threshold_nats, least=calibration.revolutions)
+        # They are zero in the test's coordinates.
+        for _ in range(calibration.revolutions):
+            test.add(np.zeros(5, dtype=np.complex128), calibration.noise, self._baseline_terms)
+        return test
 
     def _begin(self, calibration: Calibration) -> None:
         self.calibration = self._healthy = calibration
         self.rotor = calibration.rotor
         self.refused = ""
-        self._test = self._watching_test(calibration)
+        self._test = self._begun_test(calibration)
         self._begun = self.revolutions - calibration.revolutions
-        # The baseline counts as revolutions seen; they are zero in the test's coordinates.
-        for _ in range(calibration.revolutions):
-            self._test.add(np.zeros(5, dtype=np.complex128), calibration.noise, np.zeros(3))
         self._waiting.clear()
 
     def _new_test(self, threshold_nats: float, *, least: int) -> DepartureTest:
@@ -550,6 +588,8 @@ class RotorWatch:
     def _return_to_health(self) -> None:
         assert self._healthy is not None  # noqa: S101
         self._onset, self._identification, self._alarm, self._comparison = None, None, None, None
+        if self._reference is not None:
+            self._of_baseline, self._baseline_terms = len(self._lessons), self._reference.terms
         self._begin(self._healthy)
 
     def _floored(self, noise: float) -> float:
