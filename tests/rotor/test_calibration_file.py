@@ -49,19 +49,25 @@ rotors = st.builds(
 
 sizes = st.lists(positive, min_size=5, max_size=5).map(np.array)
 thousandths = st.integers(0, 1000).map(lambda n: n / 1000)
-roots = st.lists(st.lists(thousandths, min_size=3, max_size=3), min_size=3, max_size=3).map(np.array)
-# No variance is below 0 in any direction, and those of speed, rate and bend are of different size.
-matrices = st.builds(
-    lambda root, size: np.outer(size, size) * (root @ root.T),
-    roots,
-    st.lists(st.floats(1e-3, 1e3), min_size=3, max_size=3).map(np.array),
-)
+
+
+def covariances(size: int) -> st.SearchStrategy[np.ndarray]:
+    """No variance is below 0 in any direction, and those along the axes are of different size."""
+    roots = st.lists(st.lists(thousandths, min_size=size, max_size=size), min_size=size, max_size=size)
+    scales = st.lists(st.floats(1e-3, 1e3), min_size=size, max_size=size)
+    return st.builds(
+        lambda root, scale: np.outer(scale, scale) * (root @ root.T),
+        roots.map(np.array),
+        scales.map(np.array),
+    )
+
+
 laws = st.builds(
     SpeedLaw,
     follows_um=st.lists(st.lists(complexes, min_size=5, max_size=5), min_size=2, max_size=2).map(
         lambda s: np.array(s, np.complex128)
     ),
-    covariance_um2=st.lists(matrices, min_size=5, max_size=5).map(np.array),
+    covariance_um2=st.lists(covariances(3), min_size=5, max_size=5).map(np.array),
     off_um=sizes,
 )
 
@@ -88,7 +94,7 @@ fits = st.builds(
     damping_ratio=st.floats(min_value=1e-4, max_value=0.99),
     eccentricity_um=complexes,
     centre_um=complexes,
-    covariance=st.lists(positive, min_size=16, max_size=16).map(lambda c: np.array(c).reshape(4, 4)),
+    covariance=covariances(4),
     centre_uncertainty_um=positive,
     ellipticity=part,
     noise_um=positive,
@@ -208,6 +214,23 @@ def test_a_saved_calibration_can_be_loaded(tmp_path: Path) -> None:
     with pytest.raises(CalibrationFileError, match=r"no baseline within 5 % of 4400.0 rpm, but at 5110.0"):
         load_calibration(path, 4400.0)
     assert len(load_record(path).steady) == 2
+
+
+@pytest.mark.parametrize(
+    ("row", "remedy"),
+    [
+        (
+            [[1.0, -9.0, 0.0], [-9.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            "no variance can be below 0, in any direction",
+        ),
+        ([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "give the same numbers in rows and columns"),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused(row: list[list[float]], remedy: str) -> None:
+    law = SpeedLaw(np.ones((2, 5), np.complex128), np.tile(np.array(row), (5, 1, 1)), np.full(5, 0.5))
+    text = record_text(replace(record(5110.0), steady=(replace(calibration(), law=law),)))
+    with pytest.raises(CalibrationFileError, match=rf"speed_law.covariance_um2.*: {remedy}"):
+        parse_record(text, HERE)
 
 
 def test_a_file_of_an_earlier_version_knows_nothing_of_a_late_rotor() -> None:

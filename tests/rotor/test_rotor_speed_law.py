@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,10 +13,14 @@ from hypothesis import strategies as st
 from rotor.test_rotor_watch import NOISE_UM, with_change
 from support.rotor_orbits import HEALTHY, RATE_HZ, ROTOR, SPEED_RAD_S, orbits
 
-from daqsvc.rotor.synchronous.baseline import calibrate
+from daqsvc.rotor.synchronous.baseline import calibrate, with_rotor
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS, learn, speed_terms
 from daqsvc.rotor.synchronous.vectors import FORWARD, synchronous_vectors
 from daqsvc.rotor.synchronous.watch import RotorWatch
+
+if TYPE_CHECKING:
+    from daqsvc.rotor.laval import LavalRotor
+    from daqsvc.rotor.synchronous.baseline import Calibration
 
 DAMPING_RATIO = 0.03
 SLENDER = replace(ROTOR, natural_frequency_hz=SPEED_RAD_S / (2.0 * math.pi), damping_ratio=DAMPING_RATIO)
@@ -38,9 +43,11 @@ def hunting(count: int, period: float = 70.0) -> np.ndarray:
     return 0.01 * np.cos(2.0 * math.pi * np.arange(count) / period)
 
 
-def watched(moved: np.ndarray, deviation: np.ndarray) -> tuple[RotorWatch, list[int]]:
+def watched(
+    moved: np.ndarray, deviation: np.ndarray, kept: Calibration | None = None, rotor: LavalRotor = SLENDER
+) -> tuple[RotorWatch, list[int]]:
     """A watch after these revolutions, and at which it said that the machine has changed."""
-    watch = RotorWatch(SLENDER, RATE_HZ)
+    watch = RotorWatch(rotor, RATE_HZ, calibration=kept)
     reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
     return watch, [report.revolution for report in reports if report.departed]
 
@@ -83,6 +90,72 @@ def test_a_change_among_the_lessons_is_not_learnt() -> None:
     assert watch.calibration is not None
     learnt = watch.calibration.baseline[FORWARD]
     assert learnt == pytest.approx(healthy.baseline[FORWARD], abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("times", "within", "seen_by"), [(1.5, 640, 700), (2.0, 1440, 750), (3.0, 1440, 500)]
+)
+def test_a_slow_growth_is_a_change_however_long_it_is_learnt(times: float, within: int, seen_by: int) -> None:
+    moved, deviation = late_whirl(seen_by)
+    grown = 1.0 + (times - 1.0) * np.clip((np.arange(seen_by) - 60) / within, 0.0, 1.0)
+    moved[:, FORWARD] *= grown
+    watch, departed = watched(moved, deviation)
+    assert departed
+    assert watch.calibration is not None
+    assert watch.calibration.baseline[FORWARD] == pytest.approx(HEALTHY[FORWARD], rel=0.02)
+
+
+@pytest.mark.parametrize("lost", [12, 17, 35, 52])
+def test_revolutions_left_out_leave_the_rate_known(lost: int) -> None:
+    moved, deviation = late_whirl(600)
+    vectors = synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation))
+    for begin in (300, 337, 374):
+        gap = slice(begin, begin + lost)
+        noise = vectors.noise.copy()
+        noise[gap] = np.nan
+        reports = RotorWatch(SLENDER, RATE_HZ).evaluate(replace(vectors, noise=noise))
+        assert len(reports) == 600 - lost
+        assert not [report.revolution for report in reports if report.departed]
+
+
+def test_revolutions_whose_rate_is_not_known_are_not_judged() -> None:
+    """After a gap in the keyphasor, and after a start with what was learnt before."""
+    moved, deviation = late_whirl(500)
+    vectors = synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation))
+    first, _ = watched(moved, deviation)
+    watch = RotorWatch(SLENDER, RATE_HZ, calibration=first.calibration)
+    started = watch.evaluate(vectors[:20])
+    assert watch.evaluate(replace(vectors[20:30], noise=np.full(10, np.nan)), settled=False) == []
+    again = watch.evaluate(vectors[30:50])
+    for reports in (started, again):
+        judged = [report.evidence is not None for report in reports]
+        assert judged == [False] * EARLIER_SPEEDS + [True] * (20 - EARLIER_SPEEDS)
+
+
+def test_learning_goes_on_after_a_restart() -> None:
+    moved, deviation = late_whirl(900)
+    early = watched(moved[:70], deviation[:70])[0].calibration
+    kept = watched(moved[70:], deviation[70:], early)[0].calibration
+    assert early is not None
+    assert kept is not None
+    rate = np.array([0.0, 1e-3, 0.0])
+    doubts = [one.law.variance_um2(rate)[FORWARD] - one.law.off_um[FORWARD] ** 2 for one in (early, kept)]
+    assert doubts[1] < doubts[0] / 10.0
+    assert kept.baseline[FORWARD] == pytest.approx(early.baseline[FORWARD], abs=0.1)
+    # Fewer revolutions teach it no better.
+    assert watched(moved[:100], deviation[:100], kept)[0].calibration is kept
+
+
+def test_other_figures_of_the_rotor_take_their_part_of_the_law() -> None:
+    moved, deviation = late_whirl(900)
+    wrong = replace(SLENDER, natural_frequency_hz=1.05 * SLENDER.natural_frequency_hz)
+    kept = watched(moved, deviation, rotor=wrong)[0].calibration
+    assert kept is not None
+    corrected = with_rotor(kept, SLENDER)
+    # A watch takes what was kept as it is: the slope of the one rotor beside the law of the other.
+    departed = [watched(moved, deviation, one)[1] for one in (corrected, replace(kept, rotor=SLENDER))]
+    assert departed[0] == []
+    assert departed[1] != []
 
 
 def test_the_first_revolutions_teach_nothing() -> None:

@@ -12,9 +12,11 @@ from support.two_mode_rotors import RATE_HZ, UNIT_HZ, Machine, fitted, run_up
 
 from daqsvc.rotor.calibration.run_up import revolutions_of
 from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
+from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.model import Film, Pedestal, RotorParameters
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
-from daqsvc.rotor.synchronous.vectors import synchronous_vectors
+from daqsvc.rotor.synchronous.by_two_modes import damping_left
+from daqsvc.rotor.synchronous.vectors import Healthy, synchronous_vectors
 
 MACHINE = Machine()
 KNOWN = RotorParameters(
@@ -198,6 +200,19 @@ def test_one_of_them_predicts_what_a_fault_does_and_the_run_up_does_not(fault, s
         off_by.append(abs(predicted - moved) / abs(moved))
     assert off_by[0] > 0.5
     assert min(off_by) < 0.2
+
+
+@pytest.mark.parametrize(("speed_hz", "left"), [(28.0, 0.7), (28.0, 0.5), (33.0, 0.5)])
+def test_what_is_left_of_the_damping_is_by_the_rotor_that_explains_it(speed_hz, left):
+    known = alike(speed_hz)[0]
+    healthy, weaker = (
+        np.array([0.0, *machine.orbit(speed_hz), 0.0, 0.0]) for machine in (STIFF, STIFF.damped(left))
+    )
+    rotor = LavalRotor(
+        natural_frequency_hz=known.natural_frequency_hz, damping_ratio=known.damping_ratio, two_modes=known
+    )
+    machine = Healthy(healthy, 2.0 * math.pi * speed_hz, rotor, laval=False)
+    assert damping_left(weaker - healthy, machine, known) == pytest.approx(left, abs=0.06)
 
 
 def test_no_supports_are_taken_that_drive_the_shaft_in_a_direction():

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 
-_ROUNDED = 1e-9
+_ROUNDED = 1e-6
 """Part of a covariance that arithmetic leaves."""
 
 
