@@ -17,7 +17,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 
 SUM_TOLERANCE = 0.05
@@ -144,27 +144,11 @@ class BearingGeometry:
         )
 
 
-SEALS = (
-    "-2RS1",
-    "-2RSH",
-    "-2RSR",
-    "-2RS",
-    "-2RZ",
-    "-2Z",
-    "-RS",
-    "-RZ",
-    "-ZZ",
-    "-Z",
-    "2RS",
-    "ZZ",
-    "VV",
-    "DDU",
-    "LLU",
-    "LLB",
-    "RSH",
-    "NR",
+SUFFIX = re.compile(
+    r"-?(2?(RS[HLR]?|R?Z)\d?|ZZ|VV|DDU|LLU|LLB"  # seals and shields
+    r"|NR?|MA?|J|TN9?|TVH|TVP2?)$"  # snap ring and its groove, cage
 )
-"""Suffixes of seals and shields: they change nothing inside."""
+"""Suffixes that change neither number nor size of the balls, in the letters of several makers."""
 
 
 MAKER = re.compile(r"^(SKF|FAG|INA|NSK|NTN|KOYO|TIMKEN|SNR|NACHI)(?=[A-Z0-9])")
@@ -172,6 +156,8 @@ DESIGN = re.compile(r"(7[23]\d\dB|NU\d+E)[A-Z0-9]*$")
 """Designs whose further letters are of the cage, or of pairs: 7205 BECBP, NU 206 ECP."""
 CLEARANCE = re.compile(r"/?C[2-5]$")
 """Suffix of the clearance inside, which does not move the orders."""
+MISREAD = str.maketrans("OISZ", "0152")
+"""Letters that are read, or typed, for figures."""
 
 
 KINDS: Mapping[str, re.Pattern[str]] = {
@@ -219,7 +205,7 @@ def bearing_orders(designation: str) -> BearingOrders:
     """Fault orders of a bearing in the catalogue.
 
     Args:
-        designation: e.g. ``"6205-2RS"``; case, blanks and the suffixes of seals and clearance do not matter.
+        designation: e.g. ``"6205-2RS"``; case, blanks, seals, cage and clearance do not matter.
 
     Raises:
         KeyError: it is not in the catalogue; the message lists near names.
@@ -235,23 +221,40 @@ def _known_as(designation: str) -> str:
         # Behind a stroke: clearance, grease, tests; but 62/22 is a size.
         wanted = wanted[:4] + wanted[4:].partition("/")[0]
     bare = CLEARANCE.sub("", wanted).rstrip("-")
-    bare = next((bare.removesuffix(seal) for seal in SEALS if bare.endswith(seal)), bare)
+    while bare not in known and (shorter := SUFFIX.sub("", bare)) != bare:
+        bare = shorter
     joined = bare.replace("-", "")
     for name in (wanted, bare, joined, DESIGN.sub(r"\1", joined)):
         if name in known:
             return name
     # Orders of another kind are no help, however near its name is.
     kind = _kind(bare)
-    near = difflib.get_close_matches(bare, [name for name in known if _kind(name) == kind], n=4, cutoff=0.6)
-    names = f"near names: {', '.join(near)}" if near else "no name in it is near"
     of_kind = f", a {kind} bearing," if kind else ""
-    stem = bare.partition("-")[0]
-    # Of a known bearing, only the seals were written in an unusual way.
-    meant = f" (did you mean {stem}-2RS?)" if stem in known else ""
+    meant, near = _near(bare, [name for name in known if _kind(name) == kind])
+    names = [f"did you mean {' or '.join(meant)}?"] if meant else []
+    if near:
+        names.append(f"{'Other near' if meant else 'near'} names: {', '.join(near)}.")
     raise KeyError(
-        f"bearing {designation!r}{of_kind} is not in the catalogue; {names}{meant}. "
+        f"bearing {designation!r}{of_kind} is not in the catalogue; "
+        f"{' '.join(names) or 'no name in it is near.'} "
         "Give its dimensions or its orders instead: BPFI=..,BPFO=..,BSF=..,FTF=.."
     )
+
+
+def _near(wanted: str, known: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Names that are written alike, and others that are near.
+
+    Figures exchanged, a letter for a figure, and letters behind a known name are slips of whoever writes it.
+    """
+    figures = wanted.translate(MISREAD)
+    stem = wanted.partition("-")[0]
+    alike = [
+        name
+        for name in known
+        if name in {figures, stem} or (name[0] == wanted[:1] and sorted(name) == sorted(wanted))
+    ]
+    near = difflib.get_close_matches(wanted, [name for name in known if name not in alike], n=4, cutoff=0.6)
+    return alike, near
 
 
 def _orders(entry: Mapping[str, Any]) -> BearingOrders:

@@ -200,6 +200,10 @@ _TWO_SIDED = ("value", "gap_voltage")
 """Measures that can be too low, and negative."""
 _SIZES_THAT_FADE = AMPLITUDES
 """Measures that are never negative, and can be too low all the same: 1X that fades is a change, too."""
+_LEAST = {"crest_factor": 1.0, "kurtosis": 1.0}
+"""What measures of any waveform are at least, where that is more than 0."""
+_FROM_PEAK_TO_PEAK = 'write measure = "peak_to_peak", with setpoints from peak to peak'
+"""As the standards of shaft vibration have it: a limit of theirs for another measure is far too high."""
 _UPPER = ("alert", "danger")
 _HALF_A_TURN_DEG = 180.0
 
@@ -263,11 +267,11 @@ def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
                 "remove it",
                 code=UNFIT_SETPOINT,
             )
-        elif value <= 0:
+        elif value <= (least := _LEAST.get(alarm.measure, 0.0)):
             yield Finding(
                 (*at, key),
-                f"must be greater than 0: {alarm.measure} is never less",
-                "write a positive setpoint",
+                f"must be greater than {least:g}: {alarm.measure} is never less",
+                f"write a setpoint above {least:g}" if least else "write a positive setpoint",
                 code=UNFIT_SETPOINT,
             )
 
@@ -396,11 +400,15 @@ def _measure(alarm: SetpointAlarm, sensor: Sensor, at: KeyPath) -> Iterator[Find
             here,
             "is from the mean to the farthest point; the limits of shaft vibration in ISO 20816 and API 670 "
             "are peak to peak, about twice that",
-            'write measure = "peak_to_peak", with setpoints from peak to peak',
+            _FROM_PEAK_TO_PEAK,
             fatal=False,
             code=NOT_OF_STANDARD,
         )
-    instead = f'write measure = "rms" or "peak", with setpoints in {sensor.unit}'
+    instead = (
+        _FROM_PEAK_TO_PEAK
+        if isinstance(sensor, ProximityProbe)
+        else f'write measure = "rms" or "peak", with setpoints in {sensor.unit}'
+    )
     if measure == "value":
         yield Finding(
             here,

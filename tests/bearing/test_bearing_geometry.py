@@ -51,9 +51,17 @@ def test_published_orders(name: str, inner: float, outer: float, ball: float, ca
         "6205-2RS C3",
         "6205-2RSH/C3",
         "6205-C4",
+        "6205Z",
+        "6205RS",
+        "6205-RS1",
+        "6205N",
+        "6205ZNR",
+        "6205-2Z-N",
+        "6205M/C3",
+        "6205 TN9",
     ],
 )
-def test_seals_clearance_case_and_blanks_do_not_matter(name: str) -> None:
+def test_seals_cage_clearance_case_and_blanks_do_not_matter(name: str) -> None:
     assert bearing_orders(name) == catalogue()["6205"]
 
 
@@ -68,6 +76,14 @@ def test_hyphens_and_cages_of_a_design_do_not_matter(name: str) -> None:
 @pytest.mark.parametrize("name", ["7205AC", "6205ETN9", "NU2206ECP"])
 def test_other_designs_are_other_bearings(name: str) -> None:
     with pytest.raises(KeyError, match="not in the catalogue"):
+        bearing_orders(name)
+
+
+@pytest.mark.parametrize("name", ["6025", "6250", "6052", "620S", "62O5", "6205-XX", "6205-XX/C3"])
+def test_a_slip_in_a_designation_is_answered_with_what_was_meant(name: str) -> None:
+    with pytest.raises(
+        KeyError, match=r"is not in the catalogue; did you mean 6205\?( Other near names: .*\.)? Give "
+    ):
         bearing_orders(name)
 
 

@@ -292,7 +292,7 @@ def test_another_unit_or_a_machine_at_rest_is_no_change_of_the_machine(
         ((*SIZE, "--bearing", "6205"), "leave out all but one of them"),
         ((*SIZE, "--contact-deg", "90", *OPTIONS[:6]), "contact angle is 90 deg"),
         (("--balls", "30", *SIZE[2:], *OPTIONS[:6]), "30 balls of diameter 7.94 do not fit"),
-        (("--bearing", "6205-XX", "--channels", "de", "--speed-rpm", "1797"), "near names: 6205"),
+        (("--bearing", "6205-XX", "--channels", "de", "--speed-rpm", "1797"), "did you mean 6205?"),
         (
             ("--bearing", "99999", "--channels", "de", "--speed-rpm", "1797"),
             "BPFI=..,BPFO=..,BSF=..,FTF=.. [C02]",

@@ -205,7 +205,7 @@ FITTING = [
         [('measure = "rms"', 'measure = "velocity_rms"')],
         "alarms[0].measure",
         "proximity probe",
-        "in um",
+        "from peak to peak",
     ),
     (
         MOTOR,

@@ -135,7 +135,7 @@ def test_a_speed_that_is_polled_tells_of_a_start_up():
             [('measure = "rms"', 'measure = "value"')],
             "alarms[0].measure",
             'needs a trend value, but "probe-x" is a proximity probe',
-            'write measure = "rms" or "peak", with setpoints in um, or type = "trend"',
+            'write measure = "peak_to_peak", with setpoints from peak to peak, or type = "trend"',
         ),
         (
             MOTOR,

@@ -78,9 +78,9 @@ class NewCommand:
             "no-value",
         )
         for key, topic in all_topics().items():
-            group.add_argument(
-                f"--{key}", dest=f"answer {key}", metavar="ANSWER", help=topic.text.replace("%", "%%")
-            )
+            question = topic.text if topic.text.endswith("?") else f"{topic.text}."
+            words = f"{question} {topic.help}".replace("%", "%%")
+            group.add_argument(f"--{key}", dest=f"answer {key}", metavar="ANSWER", help=words)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

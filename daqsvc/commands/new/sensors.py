@@ -101,7 +101,8 @@ class Sensor(NamedTuple):
         """The measure that its limits are for, and the unit of that."""
         if self.housing:
             return ("velocity_rms", "mm/s") if self.shows_speed else ("rms", self.unit)
-        return {"proximity": ("rms", self.unit), "trend": ("value", self.unit)}.get(self.type)
+        # Limits of shaft vibration are from peak to peak (API 670, ISO 20816): as an RMS they are too high.
+        return {"proximity": ("peak_to_peak", self.unit), "trend": ("value", self.unit)}.get(self.type)
 
     @property
     def no_rms(self) -> bool:
@@ -282,8 +283,8 @@ def _bearing(text: str) -> Any:
     try:
         bearing_orders(q.line(text))
     except KeyError as error:
-        problem = f"{error.args[0]}".partition(". ")[0]
-        raise ValueError(f"{problem}. Or give balls, ball and pitch diameter in mm: 9, 7.94, 39.04") from None
+        problem = f"{error.args[0]}".partition(" Give ")[0]
+        raise ValueError(f"{problem} Or give balls, ball and pitch diameter in mm: 9, 7.94, 39.04") from None
     return text.strip()
 
 
@@ -312,7 +313,7 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
         unit = limited[0].measure[1] if limited[0].measure else ""
         names = ", ".join(one.name for one in _with_own_limits(limited))
         alert = (
-            {"um": "35", "mm": "0.035", "mil": "1.4"}.get(unit)
+            {"um": "100", "mm": "0.1", "mil": "4"}.get(unit)
             if probes
             else "2.8"
             if unit == "mm/s" and limited[0].iso

@@ -40,7 +40,8 @@ _TOPICS_BEHIND = {
     ),
     "class": Topic(
         "Which class of machine is it?",
-        "ISO 20816-3. A support is flexible if the machine's lowest frequency on it lies below its speed.",
+        "2-rigid or 2-flexible: 15 to 300 kW; 1-rigid or 1-flexible: above. By ISO 20816-3 a support is "
+        "flexible if the machine's lowest frequency on it lies below its speed.",
     ),
     "alert": Topic("Alert limit", "From here on somebody should look at the machine."),
     "danger": Topic("Danger limit", "From here on the machine takes damage."),

@@ -93,16 +93,10 @@ class LevelsPlugin(DetectorPlugin[Levels]):
             rate_hz = machine.streams[sensor.stream].rate_hz
             silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
             stale_s = max(STALE_S, math.ceil(silent_s))
-            yield from _readings(sensor, stale_s, velocity=_band_hz(machine, settings, sensor) is not None)
-            if isinstance(sensor, TrendValue):
-                continue
-            has_phase = _keyphasor_beside(machine, settings, sensor)
-            listed = _listed(settings, sensor, has_phase=has_phase)
-            for name in settings.measures:
-                if name in listed:
-                    yield Reading(
-                        f"levels/{sensor.name}", "statistics", name, UNITS.get(name, sensor.unit), stale_s
-                    )
+            for name in _shown(machine, settings, sensor):
+                yield Reading(
+                    f"levels/{sensor.name}", "statistics", name, UNITS.get(name, sensor.unit), stale_s
+                )
 
     def quality_alarms(self, machine: MachineFile, settings: Levels) -> Iterator[str]:
         """See `DetectorPlugin.quality_alarms`."""
@@ -230,18 +224,22 @@ def _band_hz(machine: MachineFile, settings: Levels, sensor: Sensor) -> tuple[fl
     return settings.band_hz(machine.streams[sensor.stream].rate_hz, machine.machine.speed_rpm)
 
 
-def _readings(sensor: Sensor, stale_s: int, *, velocity: bool) -> Iterator[Reading]:
-    detector = f"levels/{sensor.name}"
-    if isinstance(sensor, TrendValue):
-        yield Reading(detector, "statistics", "value", sensor.unit, stale_s)
-        return
-    yield Reading(detector, "statistics", "rms", sensor.unit, stale_s)
-    yield Reading(detector, "statistics", "peak", sensor.unit, stale_s)
+def _shown(machine: MachineFile, settings: Levels, sensor: Sensor) -> list[str]:
+    """Measures of a sensor that are readings: the usual ones, those listed, and those that alarms watch."""
+    shown = ["value"] if isinstance(sensor, TrendValue) else ["rms", "peak"]
     if isinstance(sensor, ProximityProbe):
-        if sensor.sensitivity_mv_per_unit is not None:
-            yield Reading(detector, "statistics", "gap_voltage", "V", stale_s)
-    elif velocity:
-        yield Reading(detector, "statistics", "velocity_rms", "mm/s", stale_s)
+        shown += ["gap_voltage"] * (sensor.sensitivity_mv_per_unit is not None)
+    elif isinstance(sensor, Accelerometer | VelocitySensor):
+        shown += [VELOCITY] * (_band_hz(machine, settings, sensor) is not None)
+    if not isinstance(sensor, TrendValue):
+        listed = _listed(settings, sensor, has_phase=_keyphasor_beside(machine, settings, sensor))
+        shown += [name for name in settings.measures if name in listed]
+    for alarm in machine.alarms:
+        if isinstance(alarm, SetpointAlarm) and sensor.name in alarm.watched:
+            shown.append(alarm.measure)
+            if isinstance(alarm, LevelAlarm) and alarm.phase is not None:
+                shown.append(PHASE_OF[alarm.measure])
+    return list(dict.fromkeys(shown))
 
 
 def _described(machine: MachineFile, settings: Levels) -> str:
