@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from support import race_records
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.geometry import bearing_orders
@@ -15,6 +16,8 @@ from daqsvc.bearing.race import RaceRules, race_test
 from daqsvc.bearing.race.judge import race_features, verdict_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
 
@@ -76,6 +79,48 @@ def test_strikes_that_fit_no_part_of_the_stated_bearing_are_told(part: str, orde
     (told,) = (note for note in verdict.notes if "fit no part of this bearing" in note)
     assert f"order {order:.2f}"[:-1] in told
     assert f"stand out at {order * SPEED_RPM / 60.0:.0f}"[:-1] in told
+
+
+# Beside a sideband of a part that is not found, of a harmonic of the cage, or of the shaft.
+@pytest.mark.parametrize("order", [4.4, 5.2, 5.9, 6.4, 6.57, 11.2])
+def test_a_part_that_is_not_found_explains_no_strikes(order: float) -> None:
+    verdict = race_test(struck(order), RATE_HZ, SPEED_RPM, BEARING)
+    assert verdict.verdict == "normal"
+    assert verdict.probability["normal"] <= 0.9
+    (note,) = (note for note in verdict.notes if "fit no part of this bearing" in note)
+    assert f"(order {order:.1f}" in note or f"(order {order - 0.1:.1f}" in note
+
+
+def test_a_part_of_another_bearing_is_not_named_by_multiples_of_stronger_strikes() -> None:
+    # Twice the rate of the outer race is that of the inner race of a 7314B.
+    verdict = race_test(strikes("outer", 10.0, strength=2.0), RATE_HZ, SPEED_RPM, bearing_orders("7314B"))
+    assert verdict.verdict == "normal"
+    assert max(verdict.probability[part] for part in ("inner", "outer", "ball")) < 0.5
+    assert verdict.probability["normal"] <= 0.5
+    assert "stronger strikes at order 3.58" in verdict.evidence["inner"].reason
+    assert any("fit no part of this bearing" in note for note in verdict.notes)
+
+
+@pytest.mark.data
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("record", "designation", "order"),
+    [
+        *(("130", name, 3.59) for name in ("6312", "ER12K", "7200B", "7202A", "7301A", "7314B")),
+        *(("105", name, 5.40) for name in ("7203B", "7215B", "5215", "7302B")),
+        ("209", "5215", 5.40),
+        *(("234", name, 3.59) for name in ("6212", "7200B", "6020")),
+    ],
+)
+def test_measured_damage_under_a_wrong_designation_has_a_note(
+    data: Path, record: str, designation: str, order: float
+) -> None:
+    (r,) = (r for r in race_records.cwru(data) if r.name == record)
+    verdict = race_test(r.samples, r.rate_hz, r.speed_rpm, bearing_orders(designation))
+    assert verdict.verdict == "normal"
+    assert verdict.probability["normal"] <= 0.9
+    (note,) = (note for note in verdict.notes if "fit no part of this bearing" in note)
+    assert f"(order {order:.2f}" in note or f"(order {order + 0.01:.2f}" in note
 
 
 @pytest.mark.parametrize("part", [None, "inner", "outer", "ball"])

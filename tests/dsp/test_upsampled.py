@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.race_records import all_records
+import scipy.signal
+from support.race_records import all_records, cwru
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
@@ -117,6 +118,35 @@ def test_a_record_that_was_sampled_too_slowly_is_refused_however_fast_it_is_stor
     assert "was sampled at 1000 Hz and upsampled (" in str(refused.value)
     assert "which leaves the band 400 to 480 Hz" in str(refused.value)
     assert "sample with 2500 Hz or more" in str(refused.value)
+
+
+@pytest.mark.parametrize("ratio", [2.3, 2.5, 3.7])
+def test_a_record_that_was_held_at_no_whole_ratio_is_not_called_dead(ratio: float) -> None:
+    samples = strikes("outer", 10.0)
+    stored = samples[(np.arange(int(ratio * len(samples))) / ratio).astype(int)]
+    with pytest.raises(UnfitError, match=r"was sampled at about 12 kHz and upsampled: \d+% .* an even pace"):
+        race_test(stored, ratio * RATE_HZ, SPEED_RPM, BEARING)
+
+
+@pytest.mark.parametrize("part", [None, "outer"])
+def test_a_steep_low_pass_makes_no_steps_and_no_wrong_samples(part: str | None) -> None:
+    rate_hz = 48_000.0
+    low = scipy.signal.butter(8, 1000.0, fs=rate_hz, output="sos")
+    samples = scipy.signal.sosfiltfilt(low, strikes(part, 5.0, rate_hz=rate_hz))
+    assert not race_test(samples, rate_hz, SPEED_RPM, BEARING).repairs
+
+
+@pytest.mark.data
+@pytest.mark.statistical
+@pytest.mark.parametrize("upsample", [held, joined])
+@pytest.mark.parametrize("name", ["130", "3005"])
+def test_a_measured_record_has_no_other_repairs_when_it_is_upsampled(
+    data: Path, name: str, upsample: Callable[[Floats, int], Floats]
+) -> None:
+    (r,) = (r for r in cwru(data) if r.name == name)
+    whole = race_test(r.samples, r.rate_hz, r.speed_rpm, r.bearing)
+    verdict = race_test(upsample(r.samples, 4), 4.0 * r.rate_hz, r.speed_rpm, r.bearing)
+    assert (verdict.verdict, verdict.repairs) == (whole.verdict, whole.repairs)
 
 
 def test_a_coarse_converter_is_told_and_the_bearing_judged_where_its_strikes_are_clear() -> None:

@@ -29,6 +29,7 @@ from daqsvc.bearing.race.lines import (
     sharpest,
     significance,
 )
+from daqsvc.bearing.race.unknown import unknown_strikes
 from daqsvc.bearing.race.verdict import PARTS, PLACES, Part, PartEvidence
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.speed.harmonics import REMEDY
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.bearing.race.unknown import UnknownStrikes
     from daqsvc.bearing.race.verdict import RaceBaseline, RaceRules, RaceWord
     from daqsvc.dsp.drive_lines import DriveLines
     from daqsvc.dsp.speed.harmonics import ShaftRate
@@ -127,6 +129,10 @@ class Scales:
         self._drives = drives
         self.covered: set[Part] = set()
         """Parts that are not testable, as a gear or a motor has a line where theirs are looked for."""
+        self.unknown: UnknownStrikes | None = None
+        """Strikes that fit no part; None if none stand out, or before `weigh`."""
+        self.struck: set[Part] = set()
+        """Parts that are not testable, as these strikes make their lines."""
         # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
         self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
         self._seen = shaft.seen
@@ -135,7 +141,17 @@ class Scales:
 
     def weigh(self) -> dict[Part, PartEvidence]:
         """Evidence for all parts; lines that the foremost part explains are no evidence for another one."""
-        evidence = {part: self._part(part) for part in PARTS}
+        evidence = {part: self._alone(part) for part in PARTS}
+        self.unknown = unknown_strikes(
+            [view.lines for view in (self._square, self._log)],
+            [view.depth for view in (self._square, self._log)],
+            self._bearing,
+            evidence,
+            self._revolutions,
+            self._rules.smear_mirrored,
+        )
+        if self.unknown is not None:
+            evidence = {part: self._part(part) for part in PARTS}
         significant = [part for part in PARTS if evidence[part].z >= evidence[part].z_limit]
         if len(significant) < 2:
             return evidence
@@ -156,6 +172,24 @@ class Scales:
         return evidence | {p: apart[p][first] for p in significant if p != first}
 
     def _part(self, part: Part, explained: Sequence[float] = ()) -> PartEvidence:
+        """Evidence for a part without the lines at some orders, and without those of stronger strikes."""
+        e = self._alone(part, explained)
+        strikes = self.unknown
+        if strikes is None or not e.testable or not e.z_limit <= e.z < strikes.z:
+            return e
+        left = self._alone(part, [*explained, *strikes.lines(self._bearing)])
+        # A ball's comb has so many places, by the cage too, that strikes leave lines in more than their own.
+        doubtful = part == "ball" or not self._may_be(part, left)
+        if self._may_be(part, e) and doubtful:
+            self.struck.add(part)
+            return replace(left, testable=False, reason=_struck(strikes))
+        return left
+
+    def _may_be(self, part: Part, e: PartEvidence) -> bool:
+        """Whether a part may be named, if the level of the machine has changed, too."""
+        return e.z >= e.z_limit and _passed(part, e, self._rules) >= self._rules.changed_ease
+
+    def _alone(self, part: Part, explained: Sequence[float] = ()) -> PartEvidence:
         """Evidence for a part without the lines at some orders."""
         rules = self._rules
         views = [view.without(explained) if explained else view for view in (self._square, self._log)]
@@ -201,8 +235,7 @@ class Scales:
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(stated, gap, rules))
         # Only of a part that may be named: of others nobody asks what made their lines.
-        may_be = e.z >= e.z_limit and _passed(part, e, rules) >= rules.changed_ease
-        if may_be and (reason := self._anothers(part, comb.order, order)):
+        if self._may_be(part, e) and (reason := self._anothers(part, comb.order, order)):
             e = replace(e, testable=False, reason=reason)
         return e
 
@@ -277,6 +310,11 @@ def _misplaced(order: float, stated: float) -> str:
         f"lines at order {order:.3f} are {abs(order / stated - 1.0):.1%} from its own {stated:.3f}, farther "
         "than slip: check bearing and speed, or what else strikes so often"
     )
+
+
+def _struck(strikes: UnknownStrikes) -> str:
+    """Why a part is not testable beside stronger strikes that fit none."""
+    return f"stronger strikes at order {strikes.order:.3f}, which fit no part, may make its lines"
 
 
 def _covered(order: float, drive: DriveLines) -> str:

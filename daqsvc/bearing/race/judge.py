@@ -35,7 +35,7 @@ from daqsvc.bearing.race.lines import (
     part_lines,
 )
 from daqsvc.bearing.race.track import shaft_track
-from daqsvc.bearing.race.unknown import unknown_strikes
+from daqsvc.bearing.race.unknown import STATED_Z
 from daqsvc.bearing.race.verdict import (
     PARTS,
     PLACES,
@@ -93,7 +93,7 @@ class RaceFeatures:
         drives: gears and motors whose lines stand out, and are taken for no part's.
         unknown: strikes that fit no part; None if none stand out.
         shared: parts whose order a gear seems to have, too.
-        covered: whether one of them has a line where a part's is looked for.
+        covered: whether a drive, or strikes that fit no part, have the lines of a part.
         spectrum: envelope spectrum, for figures.
     """
 
@@ -340,7 +340,7 @@ def _measured(
     )
     log = view_of(log_phases, log_sizes, revolutions, others)
     scales = Scales(square, log, bearing, shaft, revolutions, rules, drives)
-    evidence = scales.weigh()
+    evidence, unknown = scales.weigh(), scales.unknown
     refuse_rivals(evidence, bearing, shaft, rules.slip)
     return RaceFeatures(
         evidence=evidence,
@@ -355,9 +355,9 @@ def _measured(
         repairs=repairs,
         lost=float(np.diff(holes, axis=1).sum()),
         drives=drives,
-        unknown=unknown_strikes((square.lines, log.lines), bearing, revolutions),
+        unknown=unknown if unknown is not None and (scales.struck or unknown.z >= STATED_Z) else None,
         shared=shared,
-        covered=bool(scales.covered),
+        covered=bool(scales.covered or scales.struck),
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
             amplitude=np.sqrt(square.power),

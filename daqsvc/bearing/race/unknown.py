@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.race.lines import HARMONICS, fundamental, significance
-from daqsvc.bearing.race.verdict import PARTS
+from daqsvc.bearing.race.lines import EXPLAINED_SHARE, HARMONICS, part_lines, significance
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
-    from daqsvc.bearing.race.lines import LineEvidence
+    from daqsvc.bearing.race.lines import LineEvidence, ModulationDepth
+    from daqsvc.bearing.race.verdict import Part, PartEvidence
 
     Real = NDArray[np.float64]
 
@@ -28,16 +28,16 @@ LOWEST, HIGHEST = 1.3, 12.0
 """Orders between which strikes are looked for: slower ones are of belts and cages."""
 SEARCH = 1.1
 """How far that is, as a share of its middle to either side."""
-LEAST_Z = 15.0
-"""Significance from which on they are stated."""
+LEAST_Z = 9.0
+"""Significance from which on they may make the lines of a weaker part: no noise has it."""
+STATED_Z = 15.0
+"""Significance from which on they are stated, whatever the parts have."""
 LEAST_NATS = 10.0
 """Evidence that their own order must have."""
-NEAR = 0.025
-"""How near to a line of the bearing they may be its own, as a share."""
+HALVES = 0.01
+"""How near to a whole order, a half or a third of one they may be the shaft's, in orders."""
 SMEAR = 0.02
 """How far a harmonic of the shaft may be smeared, as a share."""
-HALVES = 0.01
-"""How near to a half or a third of an order they may be the shaft's, in orders."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,10 @@ class UnknownStrikes:
     order: float
     z: float
 
+    def lines(self, bearing: BearingOrders) -> list[float]:
+        """All orders at which they make lines: as damage of a race does, whatever bearing it is of."""
+        return part_lines("outer", self.order, bearing)
+
     def describe(self, shaft_hz: float) -> str:
         """A note for a person."""
         return (
@@ -62,14 +66,22 @@ class UnknownStrikes:
 
 
 def unknown_strikes(
-    views: Sequence[LineEvidence], orders: BearingOrders, revolutions: float
+    views: Sequence[LineEvidence],
+    depths: Sequence[ModulationDepth],
+    bearing: BearingOrders,
+    evidence: Mapping[Part, PartEvidence],
+    revolutions: float,
+    smear_mirrored: float,
 ) -> UnknownStrikes | None:
-    """The clearest strikes that fit no part; None if none are clear.
+    """The clearest strikes, if they fit no part; None if a part explains them, or none are clear.
 
     Args:
         views: evidence of lines in several views of the same signal, all on the same bins.
-        orders: of the stated bearing.
+        depths: sizes of lines in these views.
+        bearing: fault orders of the stated bearing.
+        evidence: of each of its parts.
         revolutions: of the shaft in the record.
+        smear_mirrored: power beyond a harmonic of the shaft over that of a line, from which on it is a smear.
     """
     least = np.min([view.log_ratio for view in views], axis=0)
     scale = views[0].bins_per_order
@@ -80,19 +92,35 @@ def unknown_strikes(
     # What has the clearest line at a multiple of its order strikes so often itself.
     own = (ratios[:, 0] >= np.log1p(LEAST_NATS)) & (ratios[:, 0] >= ratios.max(axis=1) - np.log(2.0))
     score[~own] = 0.0
-    best = int(np.argmax(score))
-    order = float(trials[best])
-    z = significance(float(score[best]), "outer", revolutions, SEARCH)
-    return UnknownStrikes(order, z) if z >= LEAST_Z and _is_free(order, orders) else None
+    for k in (1, 2, 3):
+        score[np.abs(k * trials - np.rint(k * trials)) <= HALVES * k] = 0.0
+    while True:
+        best = int(np.argmax(score))
+        order = float(trials[best])
+        z = significance(float(score[best]), "outer", revolutions, SEARCH)
+        if z < LEAST_Z:
+            return None
+        about = np.abs(trials - round(order)) <= SMEAR * trials
+        if about[best] and min(depth.mirrored(order) for depth in depths) >= smear_mirrored:
+            score[about] = 0.0
+            continue
+        strikes = UnknownStrikes(order, z)
+        if any(_explains(part, e, strikes, bearing) for part, e in evidence.items()):
+            return None
+        return strikes
 
 
-def _is_free(order: float, orders: BearingOrders) -> bool:
-    """Whether an order is none of a bearing, and no whole, half or third one of the shaft."""
-    parts = [h * fundamental(orders, part) for part in PARTS for h in (1, 2)]
-    sides = [orders.inner + side for side in (-1.0, 1.0)]
-    sides += [orders.ball_pass + side * orders.cage for side in (-1.0, 1.0)]
-    cages = [h * orders.cage for h in range(3, 7)] + [h * (1.0 - orders.cage) for h in range(2, 6)]
-    if any(abs(order / own - 1.0) <= NEAR for own in (*parts, *sides, *cages)):
+def _explains(part: Part, e: PartEvidence, strikes: UnknownStrikes, bearing: BearingOrders) -> bool:
+    """Whether a part that is found makes these strikes."""
+    if e.z < e.z_limit:
         return False
-    shaft = abs(order - round(order)) <= SMEAR * order
-    return not shaft and all(abs(k * order - round(k * order)) > HALVES * k for k in (2, 3))
+    rates = [e.order]
+    if part == "ball":
+        # A spot that strikes one race only does so once in each turn of the ball.
+        rates.append(0.5 * e.order)
+    if not e.testable:
+        # What strikes at a multiple instead is stated as the reason.
+        rates += [h * e.order for h in HARMONICS]
+    if e.z >= strikes.z:
+        rates += [line for rate in rates for line in part_lines(part, rate, bearing)]
+    return any(abs(strikes.order - rate) <= EXPLAINED_SHARE * rate for rate in rates)

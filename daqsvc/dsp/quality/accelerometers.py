@@ -19,7 +19,7 @@ from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE
 from daqsvc.dsp.quality.outliers import Prewhitening, blanked, despiked, find_transients, merged, runs
 from daqsvc.dsp.quality.stuck import DEAD_SHARE, coarse_step, dropouts
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit, refuse_still
-from daqsvc.dsp.quality.upsampled import SHARE_OF_RATE, upsampling
+from daqsvc.dsp.quality.upsampled import SHARE_OF_RATE, even_pace, upsampling
 from daqsvc.rounding import counted, counted_are, rounded_up
 
 if TYPE_CHECKING:
@@ -102,9 +102,12 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
         )
     refuse_beyond_any_unit(x)
-    x, gaps, notes, repairs = _bridged(x, rate_hz, low_hz)
+    x, gaps, notes, repairs, stored = _bridged(x, rate_hz, low_hz)
     refuse_still(x)
-    mended = repaired(x, rate_hz, round(60.0 * rate_hz / speed_rpm), (low_hz, top_hz))
+    # Between the samples that were measured nothing can be wrong by itself.
+    measured_hz = rate_hz if stored is None else rate_hz / stored.factor
+    band_hz = low_hz, min(top_hz, SHARE_OF_RATE * measured_hz)
+    mended = repaired(x, measured_hz, round(60.0 * measured_hz / speed_rpm), band_hz)
     x = mended.values
     clipped = clipped_share(x)
     if clipped > CLIPPED_SHARE:
@@ -115,6 +118,10 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
         )
     if clipped > CLIPPED_NOTE_SHARE:
         notes.append(f"{clipped:.2%} of the samples are clipped: sizes are too small")
+    stretches = (*gaps, *mended.stretches)
+    if stored is not None:
+        x = stored.joined(x, len(samples))
+        stretches = stored.spread(stretches, len(samples))
     offset, deviation = float(x.mean()), float(x.std())
     if abs(offset) > OFFSET_DEVIATIONS * deviation:
         notes.append(f"{OFFSET_NOTE} of {offset:.4g}, {abs(offset) / deviation:.0f} times what it measures")
@@ -122,12 +129,14 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
         x - offset,
         tuple(notes),
         (*repairs, *mended.repairs),
-        (*gaps, *mended.stretches),
+        stretches,
     )
 
 
-def _bridged(x: Real, rate_hz: float, least_hz: float) -> tuple[Real, list[Stretch], list[str], list[str]]:
-    """The channel with straight lines over what is missing, where they are long, notes, and repairs."""
+def _bridged(
+    x: Real, rate_hz: float, least_hz: float
+) -> tuple[Real, list[Stretch], list[str], list[str], Upsampling | None]:
+    """What was measured, bridged where it is missing; where that is long, notes, repairs, and upsampling."""
     good = np.isfinite(x)
     missing = 1.0 - float(good.mean())
     if missing > ACCELEROMETER_SHARE:
@@ -145,15 +154,12 @@ def _bridged(x: Real, rate_hz: float, least_hz: float) -> tuple[Real, list[Stret
     if stored is not None:
         notes.append(f"the channel was {stored.describe(rate_hz)}: only what was measured is used")
         _refuse_narrow(stored, rate_hz, least_hz)
-        x = stored.joined(x)
-    measured = x if stored is None else stored.measured(x)
-    notes += _resolution(measured)
-    held = dropouts(measured)
-    if stored is not None:
-        held = stored.spread(held, len(x))
-    held &= good
-    if not missing and not held.any():
-        return x, [], notes, []
+        x, good = stored.measured(x), stored.measured(good)
+        rate_hz /= stored.factor
+    notes += _resolution(x, rate_hz)
+    held = dropouts(x) & good
+    if good.all() and not held.any():
+        return x, [], notes, [], stored
     lost = ~good | held
     sentences = []
     if held.any():
@@ -168,7 +174,7 @@ def _bridged(x: Real, rate_hz: float, least_hz: float) -> tuple[Real, list[Stret
     taper = round(GAP_TAPER_S * rate_hz)
     long = merged((max(first - taper, 0), min(last + taper, len(x))) for first, last in long)
     x = blanked(x, long, rate_hz)
-    return x, long, notes, sentences
+    return x, long, notes, sentences, stored
 
 
 def _refuse_narrow(stored: Upsampling, rate_hz: float, least_hz: float) -> None:
@@ -186,11 +192,11 @@ def _refuse_narrow(stored: Upsampling, rate_hz: float, least_hz: float) -> None:
         )
 
 
-def _resolution(measured: Real) -> list[str]:
+def _resolution(measured: Real, rate_hz: float) -> list[str]:
     """A note where a converter's steps are large beside what it measures.
 
     Raises:
-        UnfitError: they are too large, or the channel is dead.
+        UnfitError: they are too large, or the channel is dead, or its samples were repeated.
     """
     moves = np.diff(measured)
     steady = float(np.mean(moves == 0.0))
@@ -198,6 +204,13 @@ def _resolution(measured: Real) -> list[str]:
     deviation = float(measured.std())
     if steady <= DEAD_SHARE and (step is None or step <= COARSE_NOTE * deviation):
         return []
+    if steady > DEAD_SHARE and (pace := even_pace(moves != 0.0)) is not None:
+        raise UnfitError(
+            "channel",
+            f"was sampled at about {1e-3 * rate_hz / pace:.3g} kHz and upsampled: {steady:.0%} of its "
+            "samples repeat the one before, at an even pace",
+            "give the recording at the rate that it was sampled with",
+        )
     if step is None or steady > COARSE_RESTS:
         raise UnfitError(
             "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
@@ -233,6 +246,9 @@ STEADY_REVOLUTIONS = 5
 """What begins and ends within so many revolutions is vibration, or a single event."""
 MIDDLE_OF = 50
 """One sample of so many gives the spread of all."""
+STRAY_DEVIATION = 3.0
+"""Deviation of the whitened channel from which on its filter does not whiten: the foot of a steep low-pass is
+lifted so far that only this is seen. Measured records have 0.6 to 1.8, one low-passed steeply had 22."""
 _LISTED = 3
 EMPTY_SHARE = 1e-8
 """Share of a channel's power in the analysed band below which it holds nothing: that of 14 bits rounded."""
@@ -266,6 +282,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         UnfitError: too much is wrong.
     """
     whitening = Prewhitening(samples, rate_hz, *band_hz)
+    whitening.rescale(samples, STRAY_DEVIATION)
     values = samples
     spikes: set[int] = set()
     steps: list[tuple[int, float]] = []

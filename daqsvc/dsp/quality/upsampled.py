@@ -7,15 +7,21 @@ that stays empty instead (`occupied`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.signal
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
+    from daqsvc.dsp.quality.outliers import Stretch
+
     Real = NDArray[np.float64]
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 SHARE_OF_RATE = 0.48
 """Up to this share of its rate a record can be analysed: filters against aliasing end below half."""
@@ -46,20 +52,20 @@ class Upsampling(NamedTuple):
     first: int
     held: bool
 
-    def measured(self, samples: Real) -> Real:
+    def measured(self, samples: NDArray[_Kind]) -> NDArray[_Kind]:
         """Those samples that were measured, of ``[n]``."""
         return samples[self.first :: self.factor]
 
-    def joined(self, samples: Real) -> Real:
-        """What was measured, smoothly upsampled instead, ``[n]``."""
-        smooth = scipy.signal.resample_poly(self.measured(samples), self.factor, 1, padtype="line")
+    def joined(self, measured: Real, length: int) -> Real:
+        """What was measured, smoothly upsampled instead, ``[length]``."""
+        smooth = scipy.signal.resample_poly(measured, self.factor, 1, padtype="line")
         before = np.full(self.first, smooth[0])
-        return np.concatenate((before, smooth))[: len(samples)]
+        return np.concatenate((before, smooth))[:length]
 
-    def spread(self, marks: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-        """Marks of measured samples as marks of all those that were made of them, ``[length]``."""
-        spread = np.repeat(marks, self.factor)
-        return np.concatenate((np.full(self.first, False), spread))[:length]
+    def spread(self, stretches: Iterable[Stretch], length: int) -> tuple[Stretch, ...]:
+        """Stretches of measured samples as those of the record of some length that was made of them."""
+        places = ((self.first + self.factor * at for at in stretch) for stretch in stretches)
+        return tuple((min(first, length), min(last, length)) for first, last in places)
 
     def describe(self, rate_hz: float) -> str:
         """What was done to a record, in words.
@@ -104,3 +110,26 @@ def _grid(moves: NDArray[np.bool_], *, held: bool) -> Upsampling | None:
         if counts[on] >= _LEAST_ON * rows and counts.sum() - counts[on] <= _MOST_OFF * counts[on]:
             found = Upsampling(factor, (on + 1) % factor, held)
     return found
+
+
+def even_pace(moves: NDArray[np.bool_]) -> float | None:
+    """Samples from one move to the next, where these are as even as they can be; None otherwise.
+
+    A record that was upsampled by 2.5, each sample held, moves after two or three samples. A dead sensor, or
+    a coarse converter, rests for any number of them.
+
+    Args:
+        moves: whether a record moves, ``[n]``.
+    """
+    gaps = np.diff(np.flatnonzero(moves))
+    if len(gaps) < _LEAST_SAMPLES:
+        return None
+    lengths = np.bincount(gaps)
+    usual = int(np.median(gaps))
+    near = [int(lengths[at : at + 2].sum()) for at in (usual - 1, usual)]
+    if max(near) < (1.0 - _MOST_OFF) * len(gaps):
+        return None
+    first = usual - 1 + int(near[1] >= near[0])
+    pace = float(np.mean(gaps[(gaps >= first) & (gaps <= first + 1)]))
+    # A channel that moves evenly and then rests has a pace, but keeps it for a part of the time only.
+    return pace if abs(pace * float(moves.mean()) - 1.0) <= _MOST_OFF else None
