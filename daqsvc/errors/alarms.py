@@ -81,7 +81,7 @@ UNFIT_MEASURE = Code(
     _PAGE,
     example='machine.toml:142: alarms[3].measure = "gap_voltage": is not known: "probe-x" has no '
     "sensitivity_mv_per_unit. Remedy: add sensitivity_mv_per_unit and zero_v to the sensor, or write "
-    'measure = "rms" or "peak", with setpoints in um',
+    'measure = "peak_to_peak", with setpoints from peak to peak',
 )
 NOT_MEASURED = Code(
     "A09",

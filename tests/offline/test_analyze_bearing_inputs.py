@@ -247,7 +247,7 @@ def test_a_machine_files_figures_are_those_of_its_verdict(verb: Run, tmp_path: P
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--bearing", "6205-2SR"), "did you mean 6205-2RS?"),
+        (("--bearing", "6205-2SR"), "did you mean 6205?"),
         ((), "--bearing or --orders"),
         (("--bearing", "6205-2RS", "--calibration", "motor.toml"), "name a file that daqsvc calibrate wrote"),
     ],

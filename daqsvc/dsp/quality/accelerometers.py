@@ -281,8 +281,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
     Raises:
         UnfitError: too much is wrong.
     """
-    whitening = Prewhitening(samples, rate_hz, *band_hz)
-    whitening.rescale(samples, STRAY_DEVIATION)
+    whitening = _whitening_of(samples, rate_hz, band_hz)
     values = samples
     spikes: set[int] = set()
     steps: list[tuple[int, float]] = []
@@ -330,6 +329,18 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
     if stretches:
         repairs.append(_knocks_in_words(stretches, rate_hz))
     return Repaired(values, tuple(repairs), tuple(stretches))
+
+
+def _whitening_of(samples: Real, rate_hz: float, band_hz: tuple[float, float]) -> Prewhitening:
+    """What whitens a channel in its band.
+
+    Raises:
+        UnfitError: its band is empty.
+    """
+    whitening = Prewhitening(samples, rate_hz, *band_hz)
+    if whitening.rescale(samples, STRAY_DEVIATION):
+        _refuse_empty_band(samples, rate_hz, band_hz)
+    return whitening
 
 
 def _refuse_empty_band(samples: Real, rate_hz: float, band_hz: tuple[float, float]) -> None:

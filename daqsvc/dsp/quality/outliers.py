@@ -76,16 +76,20 @@ class Prewhitening:
         variance = float(np.mean(band)) / (EXP_MEDIAN * float(np.square(taper).sum()))
         self.kernel = kernel / np.sqrt(max(variance, np.finfo(np.float64).tiny))
 
-    def rescale(self, samples: Real, limit: float) -> None:
+    def rescale(self, samples: Real, limit: float) -> bool:
         """Let a channel come out with unit deviation, if it comes out with more than a limit.
 
         Args:
             samples: ``[n]``.
             limit: deviation, as its median shows it.
+
+        Returns:
+            Whether it did.
         """
         deviation = float(np.sqrt(np.median(np.square(self(samples)[::SPARSE])) / NORMAL_SQUARE_MEDIAN))
         if deviation > limit:
             self.kernel /= deviation
+        return deviation > limit
 
     def __call__(self, samples: Real) -> Real:
         """The whitened channel, ``[n]``; beyond its ends it is thought to go on as its mirror image."""
