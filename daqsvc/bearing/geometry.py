@@ -145,7 +145,7 @@ class BearingGeometry:
 
 
 SUFFIX = re.compile(
-    r"-?(2?(RS[HLR]?|R?Z)\d?|ZZ|VV|DDU|LLU|LLB"  # seals and shields
+    r"(-2?)?((RS[HLR]?|R?Z)\d?|ZZ|VV|DDU|LLU|LLB"  # seals and shields
     r"|NR?|MA?|J|TN9?|TVH|TVP2?)$"  # snap ring and its groove, cage
 )
 """Suffixes that change neither number nor size of the balls, in the letters of several makers."""
@@ -222,7 +222,8 @@ def _known_as(designation: str) -> str:
         wanted = wanted[:4] + wanted[4:].partition("/")[0]
     bare = CLEARANCE.sub("", wanted).rstrip("-")
     while bare not in known and (shorter := SUFFIX.sub("", bare)) != bare:
-        bare = shorter
+        # 62052RS has two seals, and 6202RS has one.
+        bare = shorter[:-1] if shorter.endswith("2") and shorter[:-1] in known else shorter
     joined = bare.replace("-", "")
     for name in (wanted, bare, joined, DESIGN.sub(r"\1", joined)):
         if name in known:

@@ -59,6 +59,8 @@ def test_published_orders(name: str, inner: float, outer: float, ball: float, ca
         "6205-2Z-N",
         "6205M/C3",
         "6205 TN9",
+        "62052RS",
+        "62052Z",
     ],
 )
 def test_seals_cage_clearance_case_and_blanks_do_not_matter(name: str) -> None:
@@ -77,6 +79,12 @@ def test_hyphens_and_cages_of_a_design_do_not_matter(name: str) -> None:
 def test_other_designs_are_other_bearings(name: str) -> None:
     with pytest.raises(KeyError, match="not in the catalogue"):
         bearing_orders(name)
+
+
+@pytest.mark.parametrize("seal", ["Z", "-Z", "2Z", "-2Z", "RS", "2RS", "-RS1", "RSH", "-2RS1", "RZ"])
+@pytest.mark.parametrize("name", ["6202", "6205", "6302", "6012", "62/22"])
+def test_a_seal_is_no_part_of_the_size(name: str, seal: str) -> None:
+    assert bearing_orders(name + seal) == catalogue()[name]
 
 
 @pytest.mark.parametrize("name", ["6025", "6250", "6052", "620S", "62O5", "6205-XX", "6205-XX/C3"])

@@ -105,6 +105,30 @@ def test_a_slow_growth_is_a_change_however_long_it_is_learnt(times: float, withi
     assert watch.calibration.baseline[FORWARD] == pytest.approx(HEALTHY[FORWARD], rel=0.02)
 
 
+@pytest.mark.parametrize(("times", "within"), [(1.2, 900), (1.3, 1900)])
+def test_a_fault_that_grows_after_some_swings_is_no_lateness(times: float, within: int) -> None:
+    """By then little is left that the speed does not explain; what a fault adds to it is not allowed for."""
+    moved, deviation = late_whirl(1500)
+    moved[:, FORWARD] *= 1.0 + (times - 1.0) * np.clip((np.arange(1500) - 60) / within, 0.0, 1.0)
+    watch, departed = watched(moved, deviation)
+    assert departed
+    assert watch.calibration is not None
+    assert watch.calibration.law.off_um[FORWARD] < 1.0
+
+
+def test_what_is_kept_has_no_part_of_a_change_that_came_and_went() -> None:
+    """A return to health takes what was seen before the alarm into the baseline, not into what is kept."""
+    steady = np.tile(HEALTHY, (100, 1))
+    kept = watched(steady, np.zeros(100))[0].calibration
+    assert kept is not None
+    moved, deviation = late_whirl(450)
+    moved[:, FORWARD] *= 1.15
+    watch, _ = watched(moved, deviation, kept)
+    assert watch.learnt is not None
+    assert watch.learnt.baseline[FORWARD] == pytest.approx(kept.baseline[FORWARD], abs=0.1)
+    assert watch.learnt.revolutions == kept.revolutions
+
+
 @pytest.mark.parametrize("lost", [12, 17, 35, 52])
 def test_revolutions_left_out_leave_the_rate_known(lost: int) -> None:
     moved, deviation = late_whirl(600)

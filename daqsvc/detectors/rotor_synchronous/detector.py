@@ -324,8 +324,10 @@ class RotorSynchronousDetector:
     def _keep_what_was_learnt(self, before: Calibration) -> None:
         """Keep the baseline if it has learnt more of how 1X follows the speed."""
         calibration = self._watch.calibration
-        if self._keep is not None and calibration is not None and calibration.law is not before.law:
-            self._keep(calibration)
+        if self._keep is None or calibration is None or calibration.law is before.law:
+            return
+        if (learnt := self._watch.learnt) is not None:
+            self._keep(learnt)
 
     def _blind(self) -> Diagnosis | None:
         """The statement when no revolution has come out for too long."""

@@ -314,10 +314,19 @@ def learnt_again(
         return None
     steady = moved - law.predicted_um(terms)
     variance = _long_run_variance(steady, white, _memory(rotor, speed_rad_s))
-    baseline = calibration.baseline - law.predicted_um(of_baseline)
-    if calibration.law is not None:
-        baseline = baseline + calibration.law.predicted_um(of_baseline)
-    return replace(calibration, law=law, baseline=baseline, variance=variance), steady
+    return replace(with_law(calibration, law, of_baseline), variance=variance), steady
+
+
+def with_law(calibration: Calibration, law: SpeedLaw | None, of_baseline: Floats) -> Calibration:
+    """The same calibration where its revolutions are brought to its speed by another law.
+
+    Args:
+        calibration: the healthy machine.
+        law: how its vector follows the speed.
+        of_baseline: float64 ``[3]``, mean `speed_terms` of the revolutions that made the baseline.
+    """
+    was, now = (0.0 if one is None else one.predicted_um(of_baseline) for one in (calibration.law, law))
+    return replace(calibration, law=law, baseline=calibration.baseline + was - now)
 
 
 def with_rotor(calibration: Calibration, rotor: LavalRotor) -> Calibration:

@@ -104,6 +104,10 @@ class SpeedLaw:
         """The same where each component is turned, complex128 ``[5]``."""
         return replace(self, follows_um=self.follows_um * turns)
 
+    def within(self, before: SpeedLaw) -> SpeedLaw:
+        """The same, with no more off than by a law of before: more is left by a fault that grows slowly."""
+        return replace(self, off_um=np.minimum(self.off_um, before.off_um))
+
     def over_swings(self) -> SpeedLaw:
         """The same of means over whole swings of the speed."""
         return replace(self, off_um=np.zeros_like(self.off_um))

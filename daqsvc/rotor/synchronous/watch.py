@@ -22,6 +22,7 @@ from daqsvc.rotor.synchronous.baseline import (
     compensated,
     deviation_of,
     learnt_again,
+    with_law,
     with_more,
 )
 from daqsvc.rotor.synchronous.departure import (
@@ -274,7 +275,7 @@ class RotorWatch:
         self._of_baseline = 0
         self._baseline_terms: Floats = np.zeros(3)
         self._next_lesson = round(_MORE * self.rules.calibrate_revolutions)
-        self._first = calibration
+        self._first, self._first_terms = calibration, self._baseline_terms
         self._kept_law = calibration is not None and calibration.law is not None
         self._segment: list[JudgedRevolution] = []
         self._test: DepartureTest | None = None
@@ -291,6 +292,17 @@ class RotorWatch:
         self._thrice: Thrice | None = None
         if calibration is not None:
             self._begin(calibration)
+
+    @property
+    def learnt(self) -> Calibration | None:
+        """The healthy machine for another start: its own baseline, and what was learnt of its speed since.
+
+        The baseline grows on a return to health, and then a change that came and went may have a part in it.
+        """
+        if self._first is None or self.calibration is None:
+            return None
+        made = with_law(self._first, self.calibration.law, self._first_terms)
+        return replace(made, variance=self.calibration.variance)
 
     @property
     def state(self) -> State:
@@ -406,7 +418,7 @@ class RotorWatch:
         self._of_baseline = len(self._lessons)
         self._baseline_terms = terms[EARLIER_SPEEDS:].mean(axis=0)
         self._speeds = terms[-EARLIER_SPEEDS:, 0]
-        self._first = made
+        self._first, self._first_terms = made, self._baseline_terms
 
     def _learn(self, row: JudgedRevolution) -> None:
         """Learn again how 1X follows the speed, each time that half as many revolutions more are known."""
@@ -430,6 +442,8 @@ class RotorWatch:
         made, steady = learnt
         if self._kept_law and not _surer(made, self.calibration, terms):
             return
+        if made.law is not None and law is not None:
+            made = replace(made, law=made.law.within(law))
         self.calibration = self._healthy = made
         rows = [
             replace(one, vector=vector)
