@@ -91,6 +91,14 @@ def test_slow_frames_of_can_are_not_refused_for_a_band(tmp_path, kind):
     assert [f"{one.code}" for one in warnings] == (["F34"] if kind == "accelerometer" else [])
 
 
+@pytest.mark.parametrize(("bus", "measure"), [("can", "peak_to_peak"), ("virtual", "rms")])
+def test_limits_of_a_shaft_are_from_peak_to_peak_but_of_a_simulated_one(tmp_path, bus, measure):
+    file = tmp_path / "m.toml"
+    options = [f"--bus={bus}", "--channels=x,y", "--rate=1000", "--speed=1480", "--limits=own", "--alert=100"]
+    assert main(["new", f"{file}", "--yes", *options, *(f"--sensor={c}.type=proximity" for c in "xy")]) == 0
+    assert [(one.measure, one.alert) for one in load_machine_file(file).alarms] == [(measure, 100.0)] * 2
+
+
 def test_a_machine_slower_than_any_band_gets_no_limit_that_cannot_see_it(tmp_path):
     file = tmp_path / "m.toml"
     assert new(file, "--rate=2600", "--speed=60", "--limits=own", "--alert=0.5") == 0

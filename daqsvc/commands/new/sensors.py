@@ -90,6 +90,8 @@ class Sensor(NamedTuple):
     bearing: Any
     shows_speed: bool
     """Whether a velocity RMS of it has 1X of the machine in its band."""
+    simulated: bool
+    """Whether `daqsvc sim` plays it: with so much noise that its peaks hardly show a fault."""
 
     @property
     def housing(self) -> bool:
@@ -102,7 +104,8 @@ class Sensor(NamedTuple):
         if self.housing:
             return ("velocity_rms", "mm/s") if self.shows_speed else ("rms", self.unit)
         # Limits of shaft vibration are from peak to peak (API 670, ISO 20816): as an RMS they are too high.
-        return {"proximity": ("peak_to_peak", self.unit), "trend": ("value", self.unit)}.get(self.type)
+        of_shaft = "rms" if self.simulated else "peak_to_peak"
+        return {"proximity": (of_shaft, self.unit), "trend": ("value", self.unit)}.get(self.type)
 
     @property
     def no_rms(self) -> bool:
@@ -136,7 +139,15 @@ def sensors(answers: Answers) -> list[Sensor]:
             unit = _FIXED_UNITS.get(kind) or answers.get(sensor_key(channel, "unit"), "")
             bearing = answers.get(sensor_key(channel, "bearing"))
             answered.append(
-                Sensor(channel, answers[sensor_key(channel, "name")], kind, unit, bearing, shows_speed)
+                Sensor(
+                    channel,
+                    answers[sensor_key(channel, "name")],
+                    kind,
+                    unit,
+                    bearing,
+                    shows_speed,
+                    simulated=bus_of(answers).simulated,
+                )
             )
     return answered
 
@@ -313,7 +324,9 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
         unit = limited[0].measure[1] if limited[0].measure else ""
         names = ", ".join(one.name for one in _with_own_limits(limited))
         alert = (
-            {"um": "100", "mm": "0.1", "mil": "4"}.get(unit)
+            {"um": "35", "mm": "0.035", "mil": "1.4"}.get(unit)
+            if probes and quiet
+            else {"um": "100", "mm": "0.1", "mil": "4"}.get(unit)
             if probes
             else "2.8"
             if unit == "mm/s" and limited[0].iso
