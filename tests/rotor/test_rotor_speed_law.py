@@ -129,6 +129,15 @@ def test_what_is_kept_has_no_part_of_a_change_that_came_and_went() -> None:
     assert watch.learnt.revolutions == kept.revolutions
 
 
+def test_a_rotor_calibrated_at_steady_speed_may_be_late_when_it_hunts() -> None:
+    moved, deviation = late_whirl(500)
+    kept = watched(np.tile(HEALTHY, (100, 1)), np.zeros(100))[0].calibration
+    for begin in (0, 20, 40):
+        assert watched(moved[begin:], deviation[begin:], kept)[1] == []
+    moved[:, FORWARD] *= 1.5
+    assert watched(moved, deviation, kept)[1] != []
+
+
 @pytest.mark.parametrize("lost", [12, 17, 35, 52])
 def test_revolutions_left_out_leave_the_rate_known(lost: int) -> None:
     moved, deviation = late_whirl(600)

@@ -20,7 +20,7 @@ from daqsvc.rotor.synchronous.departure import (
     threshold_for,
     turn_per_revolution,
 )
-from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS, SpeedLaw, learn, speed_terms
+from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS, LATE, SpeedLaw, learn, speed_terms
 from daqsvc.rotor.synchronous.vectors import BACKWARD, FLOOR, FORWARD, HARMONICS, Healthy
 
 if TYPE_CHECKING:
@@ -138,7 +138,8 @@ class Calibration:
     @property
     def spread(self) -> Spread:
         """What the departure test needs."""
-        _, slope = self.rotor.speed_slope(self.speed_rad_s)
+        steep, slope = self.rotor.speed_slope(self.speed_rad_s)
+        late_rev = LATE * _settling_rev(self.rotor, self.speed_rad_s)
         return Spread(
             self.variance,
             self.noise,
@@ -146,6 +147,7 @@ class Calibration:
             self.healthy.floor_um2,
             speed_slope=slope,
             amplitude_um=self.amplitude_um,
+            late_um=late_rev * abs(steep) * self.amplitude_um,
             law=self.law,
         )
 
@@ -374,8 +376,13 @@ def begun_at(calibration: Calibration, vectors: SynchronousVectors, rate_hz: flo
 def _learnt(
     moved: Complexes, terms: Floats, white: float, rotor: LavalRotor, speed_rad_s: float
 ) -> SpeedLaw | None:
-    settling_rev = 1.0 / (2.0 * math.pi * _decay(rotor, speed_rad_s))
+    settling_rev = _settling_rev(rotor, speed_rad_s)
     return learn(moved, terms, np.full(5, white), *rotor.speed_slope(speed_rad_s), settling_rev)
+
+
+def _settling_rev(rotor: LavalRotor, speed_rad_s: float) -> float:
+    """Revolutions in which the free motion dies away, to 1/e."""
+    return 1.0 / (2.0 * math.pi * _decay(rotor, speed_rad_s))
 
 
 def _memory(rotor: LavalRotor, speed_rad_s: float) -> float:

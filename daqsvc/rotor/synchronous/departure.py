@@ -79,7 +79,9 @@ class Spread:
         drift: um^2, variance of the mean position that is the probes', not the shaft's.
         turn_rad: standard deviation of what the angle turns against the shaft in a revolution, where a
             stated speed replaces a keyphasor.
-        law: how the vector follows the speed, where that was learnt; takes the place of ``speed_slope``.
+        late_um: what 1X may be late by, in um for a change of the relative speed by 1 in a revolution.
+        law: how the vector follows the speed, where that was learnt; takes the place of ``speed_slope`` and
+            ``late_um``.
     """
 
     variance: Floats
@@ -90,6 +92,7 @@ class Spread:
     amplitude_um: float = 0.0
     drift: float = 0.0
     turn_rad: float = 0.0
+    late_um: float = 0.0
     law: SpeedLaw | None = None
 
     def of_means(
@@ -110,10 +113,12 @@ class Spread:
         share = np.asarray(1.0 / np.asarray(revolutions) + 1.0 / np.asarray(reference))[..., np.newaxis]
         variance = self.variance * share + self.floor
         terms = np.zeros(3) if terms is None else terms
-        slope = 0.0 if self.law is not None else self.speed_slope
+        guard = np.zeros(terms.shape[:-1])
         if self.law is not None:
             variance = variance + self.law.variance_um2(terms)
-        guard = (self.amplitude_um * slope * terms[..., 0]) ** 2
+        else:
+            guard += (self.amplitude_um * self.speed_slope * terms[..., 0]) ** 2
+            guard += (self.late_um * terms[..., 1]) ** 2
         guard = guard + (self.amplitude_um * self.turn_rad * np.asarray(apart)) ** 2
         variance[..., 1] += guard
         variance[..., 2] += guard

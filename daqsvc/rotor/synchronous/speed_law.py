@@ -42,7 +42,7 @@ EARLIER_SPEEDS = _SMOOTHED_REV - 1
 """Revolutions before the first one that its rate takes."""
 _LEAST_RATE_REV = 3
 """Revolutions that a rate takes."""
-_LATE = 2.0
+LATE = 2.0
 """Revolutions by which a rotor is late, over those that its free motion dies away in: one of the two modes of
 uneven supports is later than the other."""
 _LEAST_NOISE = 1e-6
@@ -155,7 +155,7 @@ def learn(
     whirl = float(np.hypot(abs(mean[FORWARD]), abs(mean[BACKWARD])))
     variance = np.maximum(variance, (_LEAST_NOISE * whirl) ** 2 + 1e-30)
     most = whirl * np.hypot(slope_spread, _MODEL_DOUBT * abs(slope))
-    late = _LATE * settling_rev
+    late = LATE * settling_rev
     steep = np.hypot(most, abs(slope) * whirl)
     prior = np.array([most, late * steep])
     # By speed and rate; the square is about how it bends.
