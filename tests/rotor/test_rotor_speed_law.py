@@ -131,11 +131,15 @@ def test_what_is_kept_has_no_part_of_a_change_that_came_and_went() -> None:
 
 def test_a_rotor_calibrated_at_steady_speed_may_be_late_when_it_hunts() -> None:
     moved, deviation = late_whirl(500)
-    kept = watched(np.tile(HEALTHY, (100, 1)), np.zeros(100))[0].calibration
-    for begin in (0, 20, 40):
-        assert watched(moved[begin:], deviation[begin:], kept)[1] == []
-    moved[:, FORWARD] *= 1.5
-    assert watched(moved, deviation, kept)[1] != []
+    watch = RotorWatch(SLENDER, RATE_HZ)
+    watch.evaluate(synchronous_vectors(orbits(np.tile(HEALTHY, (200, 1)), 1.0, 5)))
+    for times in (1.0, 1.5):
+        departed = []
+        for begin in (0, 20, 40):
+            hunts = orbits(moved[begin:] * [1.0, times, 1.0, 1.0, 1.0], 1.0, 6, deviation=deviation[begin:])
+            again = RotorWatch(SLENDER, RATE_HZ, calibration=watch.calibration)
+            departed += [report for report in again.evaluate(synchronous_vectors(hunts)) if report.departed]
+        assert bool(departed) == (times > 1.0)
 
 
 @pytest.mark.parametrize("lost", [12, 17, 35, 52])
