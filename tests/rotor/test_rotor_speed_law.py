@@ -118,15 +118,19 @@ def test_a_fault_that_grows_after_some_swings_is_no_lateness(times: float, withi
 
 def test_what_is_kept_has_no_part_of_a_change_that_came_and_went() -> None:
     """A return to health takes what was seen before the alarm into the baseline, not into what is kept."""
-    steady = np.tile(HEALTHY, (100, 1))
-    kept = watched(steady, np.zeros(100))[0].calibration
-    assert kept is not None
-    moved, deviation = late_whirl(450)
-    moved[:, FORWARD] *= 1.15
-    watch, _ = watched(moved, deviation, kept)
-    assert watch.learnt is not None
-    assert watch.learnt.baseline[FORWARD] == pytest.approx(kept.baseline[FORWARD], abs=0.1)
-    assert watch.learnt.revolutions == kept.revolutions
+    moved, deviation = late_whirl(1900)
+    healthy = moved[:, FORWARD].copy()
+    grown = 1.0 + 0.3 * np.clip((np.arange(1900) - 60) / 540, 0.0, 1.0)
+    moved[:, FORWARD] = healthy * grown
+    _, departed = watched(moved[:600], deviation[:600])
+    grown[departed[0] + 15 :] = 1.08
+    moved[:, FORWARD] = healthy * grown
+    watch, _ = watched(moved, deviation)
+    assert watch.state == "watching"
+    assert abs(watch.calibration.baseline[FORWARD]) > 1.05 * abs(HEALTHY[FORWARD])
+    assert watch.learnt.baseline[FORWARD] == pytest.approx(HEALTHY[FORWARD], rel=0.02)
+    assert watch.learnt.law is watch.calibration.law
+    assert watch.learnt.revolutions == 50
 
 
 def test_a_rotor_calibrated_at_steady_speed_may_be_late_when_it_hunts() -> None:

@@ -147,6 +147,18 @@ def test_what_is_listed_is_read_and_told_what_is_not_is_as_before():
     assert not [one for one in plain if one.key in {"kurtosis", "1x_amplitude"}]
 
 
+def test_what_an_alarm_watches_is_read_once_each_also_its_phase():
+    """Its trend is what somebody wants to see who was called by it."""
+    machine = parsed(LAVAL, ('measure = "rms"   ', 'measure = "peak_to_peak"   '))
+    told = [(one.detector, one.key, one.unit) for one in watched(machine).readings]
+    assert ("levels/probe-x", "peak_to_peak", "um") in told
+    assert len(told) == len(set(told))
+    plain = {(one.detector, one.key) for one in watched(parsed(LAVAL)).readings}
+    assert ("levels/probe-x", "peak_to_peak") not in plain
+    of_phase = {(one.detector, one.key): one.unit for one in watched(parsed(SPECIMEN)).readings}
+    assert of_phase["levels/probe-x", "1x_phase_lag"] == "deg"
+
+
 def test_what_an_alarm_is_judged_by_is_described():
     text = " ".join(describe(parsed(SPECIMEN)).split())
     assert "off 0 s; phase off 135 deg: alert 30 and danger 60 deg" in text

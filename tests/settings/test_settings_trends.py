@@ -153,6 +153,17 @@ def test_a_speed_that_is_polled_tells_of_a_start_up():
         ),
         (
             LAVAL,
+            [
+                ('measure = "rms"   ', 'measure = "crest_factor"   '),
+                ("alert = 40.0", "alert = 1.0"),
+                ("deadband = 2.0", "deadband = 0.1"),
+            ],
+            "alarms[0].alert",
+            "greater than 1: crest_factor is never less",
+            "write a setpoint above 1",
+        ),
+        (
+            LAVAL,
             [("alert = 40.0", "alert = -40.0")],
             "alarms[0].alert",
             "greater than 0: rms is never less",

@@ -58,6 +58,10 @@ CLASSES = {
     "1-rigid": "above 300 kW on a stiff foundation",
     "1-flexible": "above 300 kW on a soft one",
 }
+_SHAFT_ALERTS = {"um": "100", "mm": "0.1", "mil": "4"}
+"""Peak to peak, to begin with: what is right depends on the speed (ISO 20816-3)."""
+_SIMULATED_ALERTS = {"um": "35", "mm": "0.035", "mil": "1.4"}
+"""RMS, between the healthy and the faulty machine that `daqsvc sim` plays."""
 _ISO_RPM = (120.0, 30_000.0)
 """Speeds that ISO 20816-3 is for."""
 _BEARING_RATE_HZ, _BEARING_RPM, _BEARING_BLOCK_S = 2500.0, 600.0, 1.25
@@ -304,7 +308,6 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
     limited = [one for one in sensors(answers) if one.measure is not None]
     if not limited:
         return
-    quiet = bus_of(answers).simulated
     in_range = _ISO_RPM[0] <= abs(answers["speed"]) <= _ISO_RPM[1]
     choices = {"iso": "zones of ISO 20816-3", "own": "two figures of yours", NONE: "write them later"}
     topic, read = TOPICS["limits"], q.one_of(choices)
@@ -315,23 +318,15 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
         if in_range and (reason := slow or _other_velocities(limited) or _no_rms_words(limited)):
             why = f"No zones of ISO 20816-3: {reason}"
             topic, read = q.Topic(f"{why}\n{topic.text}", f"{why} {topic.help}"), _without_zones(read, why)
-    probes = limited[0].type == "proximity"
-    default = "own" if quiet and probes else "iso" if "iso" in choices else NONE
+    of_simulated = limited[0].simulated and limited[0].type == "proximity"
+    default = "own" if of_simulated else "iso" if "iso" in choices else NONE
     yield Question("limits", topic, read, default, choices)
     if answers["limits"] == "iso" and any(one.iso == "housing" for one in limited):
         yield Question("class", TOPICS["class"], q.one_of(CLASSES), "2-rigid", CLASSES)
     if answers["limits"] == "own":
         unit = limited[0].measure[1] if limited[0].measure else ""
         names = ", ".join(one.name for one in _with_own_limits(limited))
-        alert = (
-            {"um": "35", "mm": "0.035", "mil": "1.4"}.get(unit)
-            if probes and quiet
-            else {"um": "100", "mm": "0.1", "mil": "4"}.get(unit)
-            if probes
-            else "2.8"
-            if unit == "mm/s" and limited[0].iso
-            else None
-        )
+        alert = _usual_alert(limited[0])
         what = f"{limited[0].measure[0].replace('_', ' ')} of {names} in {unit}" if limited[0].measure else ""
         for key, factor in (("alert", 1.0), ("danger", 1.5)):
             words = q.Topic(f"{TOPICS[key].text} ({what})", TOPICS[key].help)
@@ -341,6 +336,14 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
                 q.number_in(unit) if unit else q.number,
                 alert if factor == 1.0 else _higher(answers["alert"]),
             )
+
+
+def _usual_alert(sensor: Sensor) -> str | None:
+    """An alert limit to begin with; None where nothing is usual."""
+    unit = sensor.measure[1] if sensor.measure else ""
+    if sensor.type == "proximity":
+        return (_SIMULATED_ALERTS if sensor.simulated else _SHAFT_ALERTS).get(unit)
+    return "2.8" if unit == "mm/s" and sensor.iso else None
 
 
 def _with_own_limits(there: Sequence[Sensor]) -> list[Sensor]:

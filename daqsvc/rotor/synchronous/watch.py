@@ -21,8 +21,6 @@ from daqsvc.rotor.synchronous.baseline import (
     calibrate,
     compensated,
     deviation_of,
-    learnt_again,
-    with_law,
     with_more,
 )
 from daqsvc.rotor.synchronous.departure import (
@@ -33,10 +31,19 @@ from daqsvc.rotor.synchronous.departure import (
     nonstationarity,
     threshold_for,
 )
-from daqsvc.rotor.synchronous.signatures import Energy, Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.judged import (
+    JudgedRevolution,
+    Thrice,
+    lasting_energy,
+    noise_scatter,
+    scatter,
+    thrice_of,
+)
+from daqsvc.rotor.synchronous.lessons import Lessons
+from daqsvc.rotor.synchronous.signatures import Identification, NamingRules, identify
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
-from daqsvc.rotor.synchronous.vectors import FORWARD, SynchronousVectors
+from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,118 +52,7 @@ if TYPE_CHECKING:
     from daqsvc.rotor.laval import LavalRotor
 
     Complexes = NDArray[np.complex128]
-    from collections.abc import Sequence
-
     Floats = NDArray[np.float64]
-
-
-_LEAST_ROWS = 8
-_THRICE_FLOOR = 0.001
-"""Part of the healthy whirl by which 3X may change where nothing touches."""
-_LASTING = 0.7
-"""Part of the earlier energy that must be left in the later half: a settling rotor shakes less and less."""
-
-
-@dataclass(frozen=True, slots=True)
-class JudgedRevolution:
-    """A revolution as the watch keeps it.
-
-    Attributes:
-        revolution: its number.
-        vector: complex128 ``[5]``, synchronous vector less the baseline of the calibration, um.
-        noise: variance of a sample that does not repeat with the shaft, um^2.
-        terms: float64 ``[3]``, its `speed_terms`.
-        thrice: complex128 ``[2]``, 3X forward and backward, um; NaN if not known.
-    """
-
-    revolution: int
-    vector: Complexes
-    noise: float
-    terms: Floats
-    thrice: Complexes
-
-
-def scatter(rows: Sequence[JudgedRevolution]) -> Floats:
-    """Variance of the vectors, float64 ``[5]``; zero if there are too few."""
-    if len(rows) < _LEAST_ROWS:
-        return np.zeros(5)
-    vectors = np.array([row.vector for row in rows])
-    squares = np.abs(vectors - vectors.mean(axis=0)) ** 2
-    return np.asarray(squares.sum(axis=0) / (len(rows) - 1))
-
-
-@dataclass(frozen=True, slots=True)
-class Thrice:
-    """3X over a stretch of revolutions.
-
-    Attributes:
-        mean: complex128 ``[2]``, forward and backward, um.
-        variance: float64 ``[2]``, of one revolution's, um^2.
-        revolutions: in the mean.
-    """
-
-    mean: Complexes
-    variance: Floats
-    revolutions: int
-
-    def apart_from(self, before: Thrice, amplitude_um: float) -> Floats:
-        """Variance of the difference of both means, float64 ``[2]``, um^2."""
-        share = 1.0 / self.revolutions + 1.0 / before.revolutions
-        one = np.maximum(self.variance, before.variance)
-        return np.asarray(one * share + (_THRICE_FLOOR * amplitude_um) ** 2)
-
-
-def thrice_of(rows: Sequence[JudgedRevolution]) -> Thrice | None:
-    """3X of revolutions; None where too few of them have it."""
-    known = np.array([row.thrice for row in rows if np.isfinite(row.thrice).all()])
-    if len(known) < _LEAST_ROWS:
-        return None
-    mean = known.mean(axis=0)
-    scatter_um2 = (np.abs(known - mean) ** 2).sum(axis=0) / (len(known) - 1)
-    return Thrice(mean, np.asarray(scatter_um2), len(known))
-
-
-def noise_scatter(rows: Sequence[JudgedRevolution]) -> float:
-    """Relative variance of the energy."""
-    noise = np.array([row.noise for row in rows])
-    mean = float(noise.mean())
-    return float(noise.var(ddof=1)) / mean**2 if mean > 0.0 else 0.0
-
-
-def lasting_energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy | None:
-    """The energy of the later half against the healthy one; None while it dies away."""
-    half = len(rows) // 2
-    earlier, later = _energy(rows[:half], healthy), _energy(rows[half:], healthy)
-    return later if later.excess >= _LASTING * earlier.excess else None
-
-
-def _energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy:
-    if not rows:
-        return Energy()
-    noise = float(np.mean([row.noise for row in rows]))
-    excess = max(0.0, noise - healthy.noise)
-    share = 1.0 / len(rows) + 1.0 / healthy.revolutions
-    scale = 2.0 * healthy.noise_variance * share * healthy.noise**2
-    return Energy(excess, excess**2 / scale)
-
-
-def _as_steady(made: Calibration, first: Calibration) -> bool:
-    """Whether a machine scatters as it did at first. One that scatters more has changed, or does slowly."""
-    allowed = _TWICE**2 * first.variance
-    if first.law is not None:
-        allowed = np.maximum(allowed, (_A_LITTLE * first.law.off_um) ** 2)
-    off = 0.0 if made.law is None else made.law.off_um**2
-    return bool(np.all(np.maximum(made.variance, off) <= allowed))
-
-
-def _surer(made: Calibration, before: Calibration, terms: Floats) -> bool:
-    """Whether a law leaves less uncertain than that of before, at these `speed_terms`, float64 ``[R, 3]``."""
-    apart = terms - terms.mean(axis=0)
-    doubts = [
-        0.0 if one.law is None else float(one.law.variance_um2(apart)[:, FORWARD].mean())
-        for one in (made, before)
-    ]
-    return doubts[0] < doubts[1]
 
 
 State: TypeAlias = Literal["calibrating", "watching", "departed"]
@@ -175,14 +71,6 @@ _SEGMENT_THRESHOLD_NATS = 30.0
 """A changed machine is less steady than a healthy one: only clear further changes begin a new segment."""
 _KEPT = 512
 """Revolutions that identification can reach back."""
-_MORE = 1.5
-"""Healthy revolutions over those at the last time, at which it is learnt again how 1X follows the speed."""
-_TWICE = 2.0
-"""Standard deviation over that at first, beyond which revolutions are not those of one healthy machine."""
-_A_LITTLE = 1.2
-"""The same of what their speed leaves unexplained. A fault that grows slowly does that, too."""
-_MOST_LEARNT = 2000
-"""Healthy revolutions that teach at most how 1X follows the speed."""
 _PLACED_WITHIN = 0.5
 """Samples within which a keyphasor's edge lies while no others place it."""
 _ABRUPT = 4
@@ -269,14 +157,7 @@ class RotorWatch:
         self._previous: Complexes = np.empty((0, 5), dtype=np.complex128)
         self._speeds: Floats = np.empty(0)
         self._rows: deque[JudgedRevolution] = deque(maxlen=_KEPT)
-        # Healthy revolutions, as the stated rotor alone predicts them. The baseline is of the first of them,
-        # or of none, where it was kept from before.
-        self._lessons: list[JudgedRevolution] = []
-        self._of_baseline = 0
-        self._baseline_terms: Floats = np.zeros(3)
-        self._next_lesson = round(_MORE * self.rules.calibrate_revolutions)
-        self._first, self._first_terms = calibration, self._baseline_terms
-        self._kept_law = calibration is not None and calibration.law is not None
+        self._lessons = Lessons(self.rules.calibrate_revolutions, calibration)
         self._segment: list[JudgedRevolution] = []
         self._test: DepartureTest | None = None
         self._healthy: Calibration | None = None
@@ -295,14 +176,8 @@ class RotorWatch:
 
     @property
     def learnt(self) -> Calibration | None:
-        """The healthy machine for another start: its own baseline, and what was learnt of its speed since.
-
-        The baseline grows on a return to health, and then a change that came and went may have a part in it.
-        """
-        if self._first is None or self.calibration is None:
-            return None
-        made = with_law(self._first, self.calibration.law, self._first_terms)
-        return replace(made, variance=self.calibration.variance)
+        """The healthy machine for another start; None while there is none (`Lessons.kept`)."""
+        return None if self.calibration is None else self._lessons.kept(self.calibration)
 
     @property
     def state(self) -> State:
@@ -411,49 +286,25 @@ class RotorWatch:
         """Keep what a calibration was made of: later revolutions teach more together with it."""
         moved, terms = compensated(vectors, made.rotor, made.speed_rad_s, self.rate_hz)
         first = self.revolutions - len(vectors) + 1
-        self._lessons = [
+        rows = [
             JudgedRevolution(first + i, moved[i], made.noise, terms[i], vectors.thrice[i])
             for i in range(EARLIER_SPEEDS, len(vectors))
         ]
-        self._of_baseline = len(self._lessons)
-        self._baseline_terms = terms[EARLIER_SPEEDS:].mean(axis=0)
+        self._lessons.begin(made, rows)
         self._speeds = terms[-EARLIER_SPEEDS:, 0]
-        self._first, self._first_terms = made, self._baseline_terms
 
     def _learn(self, row: JudgedRevolution) -> None:
-        """Learn again how 1X follows the speed, each time that half as many revolutions more are known."""
+        """Learn again how 1X follows the speed, where it is time to."""
         assert self.calibration is not None  # noqa: S101 - only called after it was made
-        assert self._first is not None  # noqa: S101 - as above
-        if len(self._lessons) >= _MOST_LEARNT:
+        learnt = self._lessons.add(row, self.calibration)
+        if learnt is None:
             return
-        law = self.calibration.law
-        vector = row.vector + self.calibration.baseline
-        if law is not None:
-            vector = vector + law.predicted_um(row.terms)
-        self._lessons.append(replace(row, vector=vector))
-        if len(self._lessons) < self._next_lesson:
-            return
-        self._next_lesson = round(_MORE * self._next_lesson)
-        moved = np.array([one.vector for one in self._lessons])
-        terms = np.array([one.terms for one in self._lessons])
-        learnt = learnt_again(self.calibration, moved, terms, self._baseline_terms)
-        if learnt is None or not _as_steady(learnt[0], self._first):
-            return
-        made, steady = learnt
-        if self._kept_law and not _surer(made, self.calibration, terms):
-            return
-        if made.law is not None and law is not None:
-            made = replace(made, law=made.law.within(law))
-        self.calibration = self._healthy = made
-        rows = [
-            replace(one, vector=vector)
-            for one, vector in zip(self._lessons, steady - made.baseline, strict=True)
-        ]
-        self._test = self._begun_test(made)
-        for one in rows[self._of_baseline :]:
+        self.calibration = self._healthy = learnt.calibration
+        self._test = self._begun_test(learnt.calibration)
+        for one in learnt.rows[learnt.of_baseline :]:
             self._add(one)
-        self._rows = deque(rows, maxlen=_KEPT)
-        self._previous = steady[-2:]
+        self._rows = deque(learnt.rows, maxlen=_KEPT)
+        self._previous = np.array([one.vector for one in learnt.rows[-2:]]) + learnt.calibration.baseline
 
     def _add(self, row: JudgedRevolution) -> DepartureEvidence:
         assert self._test is not None  # noqa: S101 - made with the calibration
@@ -465,7 +316,7 @@ class RotorWatch:
         test = self._new_test(threshold_nats, least=calibration.revolutions)
         # They are zero in the test's coordinates.
         for _ in range(calibration.revolutions):
-            test.add(np.zeros(5, dtype=np.complex128), calibration.noise, self._baseline_terms)
+            test.add(np.zeros(5, dtype=np.complex128), calibration.noise, self._lessons.baseline_terms)
         return test
 
     def _begin(self, calibration: Calibration) -> None:
@@ -517,7 +368,7 @@ class RotorWatch:
         assert self._test is not None  # noqa: S101
         assert self.calibration is not None  # noqa: S101
         if self._onset is None:
-            self._lessons = [one for one in self._lessons if one.revolution < onset]
+            self._lessons.before(onset)
             before = self._reference = self._test.reference_before(window)
             self._healthy = with_more(
                 self.calibration, self.calibration.baseline + before.vector, before.revolutions
@@ -603,7 +454,7 @@ class RotorWatch:
         assert self._healthy is not None  # noqa: S101
         self._onset, self._identification, self._alarm, self._comparison = None, None, None, None
         if self._reference is not None:
-            self._of_baseline, self._baseline_terms = len(self._lessons), self._reference.terms
+            self._lessons.into_baseline(self._reference.terms)
         self._begin(self._healthy)
 
     def _floored(self, noise: float) -> float:

@@ -26,7 +26,7 @@ from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.model import RotorParameters, TwoModes
-from daqsvc.rotor.synchronous.watch import WatchRules
+from daqsvc.rotor.synchronous.watch import RotorWatch, WatchRules
 from sim_hw.plants import rotor as plant
 from sim_hw.plants.rotor import keyphasor_voltage
 
@@ -94,7 +94,7 @@ def softer():
     return channels((CHANGE_REV, {"stiffness": 0.85}), revolutions=130.0, seed=2)
 
 
-def test_what_a_hunting_speed_teaches_later_is_kept_for_the_next_start():
+def test_what_a_hunting_speed_teaches_later_is_kept_for_the_next_start(monkeypatch):
     """The kept baseline would else allow for ever what one swing left uncertain."""
     turns = np.arange(190 * PER_REV) / PER_REV
     turns += 0.01 * 40.0 / (2.0 * math.pi) * np.sin(2.0 * math.pi * turns / 40.0)
@@ -104,7 +104,17 @@ def test_what_a_hunting_speed_teaches_later_is_kept_for_the_next_start():
     volts = keyphasor_voltage(turns) + 0.02 * noise[2]
     samples = np.column_stack((z.real + noise[0], z.imag + noise[1], volts)).astype(np.float32)
     kept = []
+    for_another_start = RotorWatch.learnt.fget
+    given = []
+
+    def learnt(watch):
+        given.append(for_another_start(watch))
+        return given[-1]
+
+    monkeypatch.setattr(RotorWatch, "learnt", property(learnt))
     run(detector(keep=kept.append), samples)
+    # The watch knows which baseline is for another start: after an alarm it is not the one that it judges by.
+    assert all(any(one is other for other in given) for one in kept[1:])
     assert len(kept) == 4  # at about 50, 75, 112 and 168 revolutions
     doubts = [float(one.law.variance_um2(np.array([0.0, 1e-3, 0.0]))[1]) for one in kept]
     assert doubts == sorted(doubts, reverse=True)
