@@ -51,8 +51,6 @@ _LEAST_REVOLUTIONS = 60.0
 """With fewer the sidebands of neighbouring numbers of teeth cannot be told apart."""
 _SIDEBAND_ORDERS = (1, 2, 3)
 _LEAST_PAIRS = 2
-_SHARP, _VAGUE = 0.0012, 0.006
-"""How well the shaft's speed is known, as shares, where its harmonics show it sharply and where not."""
 _MOST_SLIP = 0.08
 _MOST_POLE_PAIRS = 8
 
@@ -187,16 +185,20 @@ class LineLevels:
         return float(self._power[first : last + 1].max())
 
 
-def drive_lines(levels: LineLevels, shaft_hz: float, *, sharp: bool) -> tuple[DriveLines, ...]:
+SHARP, VAGUE = 0.0012, 0.006
+"""How well the speed of a shaft is known, as shares, where its harmonics show it sharply and where not."""
+
+
+def drive_lines(levels: LineLevels, shaft_hz: float, *, known: float) -> tuple[DriveLines, ...]:
     """Recognise a gear on a shaft, and an induction motor, by their lines in a signal.
 
     Args:
         levels: of the signal's spectrum, in which the shaft turns evenly.
         shaft_hz: revolutions per second.
-        sharp: whether the harmonics of the shaft show them sharply; a gear is looked for only then.
+        known: how well, as a share; a gear is looked for only where it is known within `SHARP`.
     """
-    gear = _gear(levels, shaft_hz) if sharp else None
-    sources = (gear, motor_lines(levels, shaft_hz, _SHARP if sharp else _VAGUE))
+    gear = _gear(levels, shaft_hz) if known <= SHARP else None
+    sources = (gear, motor_lines(levels, shaft_hz, known))
     return tuple(each for each in sources if each is not None)
 
 

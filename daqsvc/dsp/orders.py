@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import scipy.fft
 
-from daqsvc.dsp.drive_lines import LineLevels, motor_lines
+from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines
 from daqsvc.dsp.speed.lines import ORDERS, find_speed
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     Floats: TypeAlias = NDArray[np.float64]
     Flags: TypeAlias = NDArray[np.bool_]
+    from daqsvc.dsp.drive_lines import DriveLines
     from daqsvc.dsp.speed.lines import LineSpeed
 
     Complexes: TypeAlias = NDArray[np.complex128]
@@ -60,6 +61,7 @@ class OrderVectors:
             search and the uncertainty states it.
         nominal_rpm: the speed that was stated.
         revolutions_per_block: shaft revolutions in a block.
+        drives: gears and induction motors whose lines stand out.
         motor_hz: of a motor's line so near to an order that it was taken out of it; None if there is none.
     """
 
@@ -70,6 +72,7 @@ class OrderVectors:
     speed_seen: bool
     nominal_rpm: float
     revolutions_per_block: int
+    drives: tuple[DriveLines, ...] = ()
     motor_hz: float | None = None
 
     def __len__(self) -> int:
@@ -118,7 +121,8 @@ def order_vectors(
     present: Flags = np.asarray(there.all(axis=1))
     centred = np.where(present[:, np.newaxis], values - np.nanmean(values, axis=0), 0.0)
     speed = find_speed(centred, rate_hz, nominal_hz)
-    motor_hz = _motor_beside(centred, rate_hz, speed)
+    drives = _drives(centred, rate_hz, speed)
+    motor_hz = _beside_order(drives, len(centred) / rate_hz, speed.hz)
     if motor_hz is not None:
         _take_out(motor_hz, centred, present, rate_hz, speed.hz)
     amplitudes, residual, revolutions = _blocks(centred, present, rate_hz, speed.hz)
@@ -135,23 +139,31 @@ def order_vectors(
         speed_seen=speed.seen,
         nominal_rpm=abs(speed_rpm),
         revolutions_per_block=revolutions,
+        drives=drives,
         motor_hz=motor_hz,
     )
 
 
-def _motor_beside(centred: Floats, rate_hz: float, speed: LineSpeed) -> float | None:
-    """Frequency of a motor's line that a block cannot tell from an order; None if there is none."""
-    count = len(centred)
-    block_hz = speed.hz / max(1, int(count * speed.hz / rate_hz) // _BLOCKS)
+def _drives(centred: Floats, rate_hz: float, speed: LineSpeed) -> tuple[DriveLines, ...]:
+    """Gears and motors whose lines stand out, one of each kind at most."""
     known = speed.deviation_hz / speed.hz * _DEVIATIONS
+    found: dict[str, DriveLines] = {}
     for channel in range(centred.shape[1]):
         spectrum = scipy.fft.rfft(centred[:, channel])
-        levels = LineLevels(spectrum, rate_hz / count, ORDERS[-1] * speed.hz + _MOTOR_TOP_HZ)
-        motor = motor_lines(levels, speed.hz, known)
-        if motor is not None:
-            away = min(abs(motor.frequency_hz - order * speed.hz) for order in ORDERS)
-            if away < _BLOCK_WIDTHS * block_hz:
-                return motor.frequency_hz
+        top_hz = max(TOP_ORDER * speed.hz, ORDERS[-1] * speed.hz + _MOTOR_TOP_HZ)
+        levels = LineLevels(spectrum, rate_hz / len(centred), top_hz)
+        for drive in drive_lines(levels, speed.hz, known=known):
+            found.setdefault(drive.kind, drive)
+    return tuple(found.values())
+
+
+def _beside_order(drives: Sequence[DriveLines], seconds: float, speed_hz: float) -> float | None:
+    """Frequency of a motor's line that a block cannot tell from an order; None if there is none."""
+    block_hz = speed_hz / max(1, int(seconds * speed_hz) // _BLOCKS)
+    for drive in drives:
+        away_hz = min(abs(drive.frequency_hz - order * speed_hz) for order in ORDERS)
+        if drive.kind == "motor" and away_hz < _BLOCK_WIDTHS * block_hz:
+            return drive.frequency_hz
     return None
 
 

@@ -24,7 +24,7 @@ from daqsvc.rotor.orders import OrderChange, OrderRules, compare_orders
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
-    from collections.abc import Container
+    from collections.abc import Container, Iterator
 
     from numpy.typing import NDArray
 
@@ -366,12 +366,8 @@ def analyse_orders(
         )
     if orders.speed_seen and (problem := off_stated_speed(orders.speed_rpm, setup.speed_rpm)):
         quality = quality.with_problem(problem)
-    if orders.motor_hz is not None:
-        order = round(60.0 * orders.motor_hz / orders.speed_rpm)
-        quality = quality.with_problem(
-            f"a line of an induction motor stands out at {orders.motor_hz:.2f} Hz, twice the mains: it was "
-            f"taken out of {order}X, {order * orders.speed_rpm / 60.0:.2f} Hz, as it is no fault of the rotor"
-        )
+    for note in _of_drives(orders):
+        quality = quality.with_problem(note)
     if not baseline.speed_seen:
         quality = quality.with_problem(
             f"no order of {setup.speed_rpm:g} rpm stands out of the healthy run {baseline_name}: if it "
@@ -380,3 +376,24 @@ def analyse_orders(
     return OrderVerdict(
         recording=name, baseline=baseline_name, setup=setup, quality=quality, orders=orders, change=change
     )
+
+
+def _of_drives(orders: OrderVectors) -> Iterator[str]:
+    """What lines of gears and motors do to the comparison."""
+    speed_hz = orders.speed_rpm / 60.0
+    for drive in orders.drives:
+        if drive.kind == "gear":
+            yield (
+                f"a gear of {drive.teeth} teeth on this shaft meshes at {drive.frequency_hz:.1f} Hz with a "
+                f"mate of {drive.mate_teeth} teeth: its lines count as vibration beside the orders"
+            )
+            continue
+        line = f"a line of an induction motor stands out at {drive.frequency_hz:.2f} Hz, twice the mains"
+        if drive.frequency_hz == orders.motor_hz:
+            order = round(drive.order)
+            yield (
+                f"{line}: it was taken out of {order}X, {order * speed_hz:.2f} Hz, as it is no fault of the "
+                "rotor"
+            )
+        else:
+            yield f"{line}: it counts as vibration beside the orders, and is no fault of the rotor"

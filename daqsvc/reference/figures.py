@@ -69,6 +69,11 @@ FIGURES: Mapping[str, Mapping[str, Figure]] = {
         "departure": Figure("nat", "how far the synchronous vectors are from the baseline"),
         "departure.energy": Figure("nat", "the same of what does not repeat with the shaft"),
         "severity": Figure("", "size of the change over the amplitude of the healthy whirl"),
+        "line.frequency": Figure(
+            "Hz", "of a line that came with the change and is at no harmonic of the shaft, if one stands out"
+        ),
+        "line.order": Figure("", "the same per revolution of the shaft"),
+        "line.amplitude": Figure("um", "root mean square radius of its motion"),
         "FAULT.ratio": Figure("", "`unbalance`: 1X vector after over before the change"),
         "FAULT.change_um": Figure(
             "um",

@@ -12,7 +12,7 @@ from support.race_records import all_records, cwru
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import judge, race_test
-from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines
+from daqsvc.dsp.drive_lines import SHARP, TOP_ORDER, LineLevels, drive_lines
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,7 +27,7 @@ SHAFT_HZ = SPEED_RPM / 60.0
 def found(samples: NDArray[np.float64], shaft_hz: float = SHAFT_HZ) -> tuple[DriveLines, ...]:
     spectrum = scipy.fft.rfft(samples - samples.mean())
     levels = LineLevels(spectrum, RATE_HZ / len(samples), TOP_ORDER * shaft_hz)
-    return drive_lines(levels, shaft_hz, sharp=True)
+    return drive_lines(levels, shaft_hz, known=SHARP)
 
 
 @pytest.mark.parametrize(

@@ -187,6 +187,46 @@ def test_a_motors_line_beside_2x_is_no_fault_of_the_rotor() -> None:
     assert orders(1).motor_hz is None
 
 
+OF_A_MOTOR = (
+    "a line of an induction motor stands out at 100.00 Hz, twice the mains: it counts as vibration beside "
+    "the orders, and is no fault of the rotor"
+)
+OF_A_GEAR = (
+    "a gear of 23 teeth on this shaft meshes at 568.1 Hz with a mate of 60 teeth: its lines count as "
+    "vibration beside the orders"
+)
+
+
+@pytest.mark.parametrize(
+    ("lines", "note"),
+    [
+        ({100.0: 0.4}, OF_A_MOTOR),
+        (
+            {23 * 24.7: 0.6, 46 * 24.7: 0.3}
+            | {k * 23 * 24.7 + side * 24.7 * 23 / 60: 0.1 for k in (1, 2) for side in (-2, -1, 1, 2)},
+            OF_A_GEAR,
+        ),
+    ],
+)
+def test_lines_of_a_drive_beside_the_orders_are_stated(
+    lines: dict[float, float], note: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rate_hz = 4000.0
+    t = np.arange(60_000) / rate_hz
+    for name, size in (("healthy", 0.0), ("today", 1.0)):
+        rng = np.random.default_rng(int(size))
+        samples = 0.3 * rng.standard_normal((len(t), 1))
+        samples[:, 0] += sum(a * np.cos(2 * np.pi * k * 24.7 * t) for k, a in enumerate(HARMONICS, 1))
+        samples[:, 0] += size * sum(um * np.cos(2 * np.pi * hz * t + hz) for hz, um in lines.items())
+        np.savez(tmp_path / f"{name}.npz", x=samples[:, 0], fs=rate_hz)
+    options = ["--channels", "x", "--speed-rpm", "1482", "--json"]
+    files = [str(tmp_path / "today.npz"), "--baseline", str(tmp_path / "healthy.npz")]
+    assert main(["analyze", *files, *options]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["data_quality"]["problems"] == [note]
+    assert document["verdict"] in {"normal", "unmodelled"}
+
+
 def test_probabilities_sum_to_one() -> None:
     for scale in ((1.0, 1.0, 1.0), (1.3, 1.0, 1.0), (3.0, 2.0, 1.0), (1.0, 5.0, 1.0)):
         change = compared(scale)

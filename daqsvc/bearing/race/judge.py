@@ -50,7 +50,7 @@ from daqsvc.bearing.race.verdict import (
     RaceVerdict,
     band_levels,
 )
-from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines
+from daqsvc.dsp.drive_lines import SHARP, TOP_ORDER, VAGUE, LineLevels, drive_lines
 from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import LEAST_BAND, checked
@@ -321,7 +321,8 @@ def _measured(
     )
     revolutions = shaft.rate_hz / step_hz
     # On an even angle of the shaft the lines of a motor are none, and in even time those of a gear.
-    drives = drive_lines(line_levels, shaft.rate_hz, sharp=shaft.sharp) if track is None else ()
+    known = SHARP if shaft.sharp else VAGUE
+    drives = drive_lines(line_levels, shaft.rate_hz, known=known) if track is None else ()
     ambiguous = [drive for drive in drives if _is_bearings(drive, bearing, rules.slip)]
     notes = (*notes, *(f"{drive.describe_as_doubt()}: taken for the bearing's" for drive in ambiguous))
     shared = tuple(

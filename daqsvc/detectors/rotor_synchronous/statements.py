@@ -46,6 +46,8 @@ _UNITS = {
     "mean.x": "um",
     "mean.y": "um",
     "noise": "um",
+    "line.frequency": "Hz",
+    "line.amplitude": "um",
     "departure": "nat",
     "departure.energy": "nat",
 }
@@ -246,6 +248,12 @@ class Stater:
             statistics["departure.energy"] = report.evidence.energy_nats
         if report is not None and report.identification is not None:
             statistics["severity"] = report.identification.severity
+            if (line := report.identification.line) is not None:
+                statistics |= {
+                    "line.frequency": line.frequency_hz,
+                    "line.order": line.order,
+                    "line.amplitude": line.amplitude_um,
+                }
             if calibration is not None and report.identification.named:
                 statistics |= self._levels(report.identification, calibration)
         return statistics

@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousLine
     from daqsvc.rotor.synchronous.signatures import Identification
     from daqsvc.rotor.synchronous.vectors import SynchronousVectors
     from daqsvc.rotor.synchronous.watch import WatchReport
 
 VERDICTS: tuple[RotorFault, ...] = get_args(RotorFault)
+_CLEAR = 0.9
+"""Probability from which on the others of a group are only not excluded."""
 
 
 class InstantJson(TypedDict):
@@ -102,6 +105,24 @@ class CalibrationJson(TypedDict):
     verdict: str
 
 
+class LineJson(TypedDict):
+    """A line that came with a change and is at no harmonic of the shaft.
+
+    Attributes:
+        frequency_hz: where it is.
+        order: the same per revolution of the shaft.
+        amplitude_um: root mean square radius of its motion.
+        forward: whether the shaft goes around more with its rotation than against it.
+        mains: 1 at the frequency of the mains, 2 at twice that; 0 elsewhere.
+    """
+
+    frequency_hz: float
+    order: float
+    amplitude_um: float
+    forward: bool
+    mains: int
+
+
 class RotorVerdictJson(TypedDict):
     """The verdict about the rotor, by the calibrated rotor or by the bank; lengths in um.
 
@@ -115,6 +136,7 @@ class RotorVerdictJson(TypedDict):
         severity: size of the change over the amplitude of the healthy whirl; null if healthy.
         level: by fault of the group how large it would be, in its own terms.
         change_um: by order the change of the vector, real and imaginary part; null if healthy.
+        line: that came with the change beside the shaft's harmonics; null if none stands out.
         onset: estimated begin of the change; null if there is none.
         departure: where the alarm was raised; null if it was not.
         declaration: where the last group was first named; null if it was not.
@@ -139,6 +161,7 @@ class RotorVerdictJson(TypedDict):
     severity: float | None
     level: dict[str, dict[str, float | None]]
     change_um: dict[str, list[float]] | None
+    line: LineJson | None
     onset: InstantJson | None
     departure: InstantJson | None
     declaration: InstantJson | None
@@ -314,6 +337,11 @@ class RotorVerdict(Verdict):
         """The verdict about a recording that cannot be judged."""
         return cls(recording=recording, quality=quality or DataQuality(0), refused=why)
 
+    @property
+    def line(self) -> NonsynchronousLine | None:
+        """That came with the change beside the shaft's harmonics; None if none stands out."""
+        return None if self.identification is None else self.identification.line
+
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite, lengths in um."""
         change = None if self.identification is None else self.identification.change
@@ -334,6 +362,7 @@ class RotorVerdict(Verdict):
                 str(order): [value.real, value.imag]
                 for order, value in zip(HARMONICS, change.tolist(), strict=True)
             },
+            "line": None if self.line is None else _line_json(self.line),
             "onset": _json_of(self.onset),
             "departure": _json_of(self.departure),
             "declaration": _json_of(self.declaration),
@@ -363,6 +392,8 @@ class RotorVerdict(Verdict):
             lines += [alarm.describe() for alarm in self.alarms]
         if self.identification is not None and self.calibration is not None:
             lines.append(self._change())
+            if self.line is not None:
+                lines.append(self.line.describe())
             lines += [
                 f"{words(fault)}: {', '.join(_figure(key, value) for key, value in level.items())}"
                 for fault, level in self.level.items()
@@ -408,6 +439,10 @@ class RotorVerdict(Verdict):
             return f"normal through {self.revolutions} revolutions"
         if not self.named:
             modes += " (not yet settled)"
+        elif len(self.group) > 1 and chance >= _CLEAR:
+            others = " and ".join(words(name) for name in self.group[1:])
+            excluded = "is" if len(self.group) == 2 else "are"
+            modes += f" ({words(self.verdict)} {_percent(chance)}, but {others} {excluded} not excluded)"
         elif len(self.group) > 1:
             modes += f" (cannot be told apart; {words(self.verdict)} {_percent(chance)})"
         else:
@@ -457,6 +492,16 @@ def _grown(calibration: Calibration, revolutions: int | None) -> Calibration:
 
 def _json_of(instant: Instant | None) -> InstantJson | None:
     return None if instant is None else instant.as_json()
+
+
+def _line_json(line: NonsynchronousLine) -> LineJson:
+    return {
+        "frequency_hz": line.frequency_hz,
+        "order": line.order,
+        "amplitude_um": line.amplitude_um,
+        "forward": line.forward,
+        "mains": line.mains,
+    }
 
 
 def place_of(instant: Instant) -> str:

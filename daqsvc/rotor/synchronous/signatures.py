@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousLine
     from daqsvc.rotor.synchronous.transient import Comparison
 
     Complexes = NDArray[np.complex128]
@@ -500,6 +501,7 @@ class Identification:
         severity: size of the change, its non-harmonic energy included, over the healthy whirl's amplitude.
         excess: variance of a complex sample that does not repeat with the shaft, above the healthy one, um^2.
         candidates: verdict and group of this evaluation alone.
+        line: that came with the change beside the harmonics of the shaft; None if none stands out.
     """
 
     verdict: RotorFault
@@ -511,6 +513,7 @@ class Identification:
     severity: float
     candidates: tuple[RotorFault, ...] = field(default=())
     excess: float = 0.0
+    line: NonsynchronousLine | None = None
 
 
 def identify(
@@ -523,6 +526,7 @@ def identify(
     may_name: bool = True,
     comparison: Comparison | None = None,
     energy: Energy | None = None,
+    line: NonsynchronousLine | None = None,
 ) -> Identification:
     """Weigh the hypotheses.
 
@@ -537,6 +541,8 @@ def identify(
         comparison: what the transient shows of unbalance and loss of damping, if it was abrupt.
         energy: of the present segment; motion that does not repeat with the shaft (whirl, repeated
             impacts) is what no linear fault makes.
+        line: that came with the change beside the harmonics. Where the mains are what has changed, it is no
+            fault of the rotor, whatever the vector of a part of their beat looks like.
     """
     amplitude = healthy.healthy.amplitude_um
     least = (rules.least_severity * amplitude) ** 2
@@ -557,6 +563,14 @@ def identify(
         explained = {"unmodelled"} if scores["rub"] < rules.margin_nats else {"unmodelled", "rub"}
         for name in scores.keys() - explained:
             scores[name] -= unexplained
+    excess = energy.excess if energy is not None and energy.nats > _ENERGY_NATS else 0.0
+    by_mains = False
+    if line is not None and line.is_the_change:
+        by_mains = True
+        excess = max(excess, line.amplitude_um**2)
+        square = max(square, line.amplitude_um**2)
+        for name in scores.keys() - {"unmodelled"}:
+            scores[name] = min(scores[name], scores["unmodelled"] - _MOST_ENERGY_NATS)
     size = math.sqrt(square)
     # The typical component: that of the mean position may be drift of the probes, or not there at all.
     deviation = math.sqrt(float(np.median(variance)))
@@ -569,9 +583,12 @@ def identify(
     else:
         marked = shaken or has_marks(change, variance)
         candidates = _group(scores, best, healthy, rules, marked=marked)
-    agreed = previous is not None and (
-        set(previous.candidates) == set(candidates)
-        or (model_holds and set(candidates) < set(previous.candidates))
+    agreed = by_mains or (
+        previous is not None
+        and (
+            set(previous.candidates) == set(candidates)
+            or (model_holds and set(candidates) < set(previous.candidates))
+        )
     )
     # That the machine may be healthy again is for the watch to decide; until then a name is kept.
     named = may_name and agreed and "normal" not in candidates
@@ -589,7 +606,8 @@ def identify(
         change=change,
         severity=size / max(amplitude, 1e-12),
         candidates=candidates,
-        excess=energy.excess if energy is not None and energy.nats > _ENERGY_NATS else 0.0,
+        excess=excess,
+        line=line,
     )
 
 

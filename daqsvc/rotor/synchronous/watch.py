@@ -40,6 +40,7 @@ from daqsvc.rotor.synchronous.judged import (
     thrice_of,
 )
 from daqsvc.rotor.synchronous.lessons import Lessons
+from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousSearch
 from daqsvc.rotor.synchronous.signatures import Identification, NamingRules, identify
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
@@ -171,6 +172,7 @@ class RotorWatch:
         self._alarm: tuple[int, int] | None = None
         self._comparison: Comparison | None = None
         self._thrice: Thrice | None = None
+        self._lines = NonsynchronousSearch(rate_hz, self.rules.speed_uncertainty)
         if calibration is not None:
             self._begin(calibration)
 
@@ -206,7 +208,9 @@ class RotorWatch:
             if orbits is not None:
                 part = slice(int(orbits.starts[i]), ends[i])
                 z = orbits.xy[part, 0] + 1j * orbits.xy[part, 1]
-                self._orbits.add(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z)
+                turns = orbits.angle_rad[part] / (2.0 * math.pi)
+                self._orbits.add(self.revolutions, turns, z)
+                self._lines.add(self.revolutions, orbits.first_index + part.start, turns, z)
             if one.usable[0]:
                 reports.append(self._take(one, settled=settled))
             else:
@@ -353,7 +357,7 @@ class RotorWatch:
         if self._onset is None:
             return True
         since = row.revolution - self._reference_from
-        if since < _SETTLING:
+        if since < _SETTLING or self._by_mains:
             return False
         if since < _SETTLING + _LEAST_SEGMENT:
             self._segment.append(row)
@@ -363,6 +367,12 @@ class RotorWatch:
                     self._add(earlier)
             return False
         return True
+
+    @property
+    def _by_mains(self) -> bool:
+        """Whether the mains are what has changed: they beat with the harmonics without end."""
+        line = self._lines.line
+        return line is not None and line.is_the_change
 
     def _depart(self, onset: int, window: int) -> None:
         assert self._test is not None  # noqa: S101
@@ -375,6 +385,7 @@ class RotorWatch:
             )
             self._middle = self._begun + before.revolutions / 2.0
             self._thrice = thrice_of([row for row in self._rows if row.revolution < onset])
+            self._lines.depart(onset)
         self._onset = onset
         # A slow change is seen long after its onset: what came before belongs to the reference of before.
         self._reference_from = max(onset, onset + window - 1 - _SETTLING)
@@ -448,6 +459,7 @@ class RotorWatch:
             may_name=may_name,
             comparison=self._comparison,
             energy=lasting_energy(rows, self._healthy) if since >= _NAMED_FROM else None,
+            line=self._lines.evaluate(revolution, self._healthy),
         )
 
     def _return_to_health(self) -> None:

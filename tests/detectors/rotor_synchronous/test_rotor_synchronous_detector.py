@@ -475,3 +475,18 @@ def test_the_listener_hears_every_judged_revolution(steady):
     for report, vectors in heard:
         assert report.end_index == vectors.end_index[0]
     assert np.diff([report.end_index for report, _ in heard]) == pytest.approx(PER_REV, abs=1)
+
+
+def test_the_mains_are_stated_with_their_frequency_and_no_fault_is_named(steady):
+    t = np.arange(len(steady)) / RATE_HZ
+    hum = 6.0 * np.cos(2.0 * math.pi * 60.0 * t) * (t > 2.2)
+    samples = steady + np.column_stack((hum, 0.3 * hum, np.zeros_like(hum))).astype(np.float32)
+    diagnoses = run(detector(), samples)
+    assert diagnoses[-1].decision == "unmodelled"
+    assert diagnoses[-1].group == ()
+    statistics, units = diagnoses[-1].statistics, diagnoses[-1].units
+    assert statistics["line.frequency"] == pytest.approx(60.0, abs=0.1)
+    assert statistics["line.order"] == pytest.approx(2.4, abs=0.005)
+    assert statistics["line.amplitude"] == pytest.approx(6.0 * math.sqrt(1.09 / 2.0), rel=0.1)
+    assert (units["line.frequency"], units["line.amplitude"]) == ("Hz", "um")
+    assert not any("line.frequency" in said.statistics for said in run(detector(), steady))
