@@ -31,6 +31,7 @@ from daqsvc.rotor.detectability.evidence import (
     steady_growth,
 )
 from daqsvc.rotor.misfit import differs_from
+from daqsvc.rotor.synchronous.departure import threshold_for
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -146,8 +147,8 @@ def _changing_steps(growth: Growth) -> Iterator[tuple[int, float, float]]:
 Fault = Literal["unbalance", "damping_loss", "stiffness_loss", "static_load"]
 
 FAULTS: tuple[Fault, ...] = ("unbalance", "damping_loss", "stiffness_loss", "static_load")
-VECTOR_THRESHOLD_NATS = 20.0
-"""Departure test of the synchronous vector: about one false alarm in 10,000 revolutions."""
+VECTOR_THRESHOLD_NATS = threshold_for(0.1)
+"""Departure test of the synchronous vector, for one false alarm in 10,000 revolutions."""
 _VECTOR_FLOOR = 0.002
 """Part of |1X| that the synchronous vector's baseline is never taken to be better than."""
 _LOG_TOLERANCE = 0.005
