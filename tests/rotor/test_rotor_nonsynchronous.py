@@ -59,47 +59,141 @@ def flat_line(hz, um):
     return lambda t: um * (1.0 + 0.3j) * np.cos(2.0 * math.pi * hz * t + 0.3)
 
 
-@pytest.mark.parametrize("line", [round_line, flat_line])
+BESIDE = [
+    (TWO_POLE_HZ, 49.97, 1, flat_line),  # beside 1X
+    (TWO_POLE_HZ, 49.97, 0, round_line),  # another machine: cables give both probes the same
+    (TWO_POLE_HZ, 100.05, 2, flat_line),  # beside 2X
+    (TWO_POLE_HZ, 100.05, 2, round_line),
+    (24.7, 100.0, 2, flat_line),  # beside 4X
+    (24.7, 100.0, 2, round_line),
+    (24.7, 50.0, 1, flat_line),  # beside 2X
+    (59.4, 120.1, 2, round_line),
+    (83.0, 50.0, 1, flat_line),  # below 1X
+    (31.3, 32.6, 0, round_line),  # another machine
+]
+
+
 @pytest.mark.parametrize("um", [4.0, 12.0])
-@pytest.mark.parametrize(
-    ("shaft_hz", "hz", "mains"),
-    [
-        (TWO_POLE_HZ, 49.97, 1),  # beside 1X
-        (TWO_POLE_HZ, 100.05, 2),  # beside 2X
-        (24.7, 100.0, 2),  # beside 4X
-        (24.7, 50.0, 1),  # beside 2X
-        (59.4, 120.1, 2),
-        (83.0, 50.0, 1),  # below 1X
-    ],
-)
-def test_the_mains_are_named_and_no_fault_of_the_rotor_is(shaft_hz, hz, mains, um, line):
-    watch, reports = watched(shaft_hz, line(hz, um))
+@pytest.mark.parametrize(("shaft_hz", "hz", "mains", "line"), BESIDE)
+def test_what_is_not_the_rotors_is_named_as_that(shaft_hz, hz, mains, um, line):
+    watch, reports = watched(shaft_hz, line(hz, um), revolutions=700)
     found = watch.finish()
     assert found.group == ("unmodelled",)
     assert found.named
+    assert found.by_line
     assert found.line.mains == mains
-    assert found.line.is_the_change
+    assert found.line.forward is (None if line is flat_line else True)
     assert found.line.frequency_hz == pytest.approx(hz, abs=0.04)
     assert found.line.order == pytest.approx(hz / shaft_hz, abs=0.001)
     rms = um if line is round_line else um * math.sqrt(1.09 / 2.0)
     assert found.line.amplitude_um == pytest.approx(rms, rel=0.08)
-    # It beats for ever, and is one alarm all the same, by then ...
-    assert not any(report.departed for report in reports if report.revolution > HEALTHY_REVOLUTIONS + 60)
+    # It beats for ever, and is one alarm all the same, by the time that it is known ...
+    slow = 3.0 / abs(hz / shaft_hz - 1.0) if mains == 0 else 60
+    late = [one for one in reports if one.revolution > HEALTHY_REVOLUTIONS + max(slow, 100)]
+    assert late
+    assert not any(report.departed for report in late)
     # ... and nothing of the rotor is named any more.
-    late = [one.identification for one in reports if one.revolution > HEALTHY_REVOLUTIONS + 60]
-    assert {one.group for one in late} == {("unmodelled",)}
+    assert {one.identification.group for one in late} == {("unmodelled",)}
 
 
-def test_what_is_said_of_the_mains():
+@pytest.mark.parametrize(("shaft_hz", "hz", "mains", "line"), BESIDE)
+def test_a_fault_that_comes_after_a_line_is_named(shaft_hz, hz, mains, line):
+    rows = np.tile(HEALTHY, (HEALTHY_REVOLUTIONS + 1000, 1))
+    begin = HEALTHY_REVOLUTIONS + 600
+    rows[begin:, 1] *= 1.5
+    watch, reports = watched(shaft_hz, line(hz, 8.0), vectors=rows, revolutions=1000)
+    before = next(one for one in reports if one.revolution == begin - 1)
+    assert before.identification.group == ("unmodelled",)
+    found = watch.finish()
+    assert "unbalance" in found.group
+    assert "unmodelled" not in found.group
+    assert not found.by_line
+    assert found.line.mains == mains
+    assert found.line.frequency_hz == pytest.approx(hz, abs=0.04)
+    assert abs(found.change[1]) == pytest.approx(0.5 * abs(HEALTHY[1]), rel=0.1)
+    again = [one.revolution for one in reports if one.departed and one.revolution > begin]
+    assert len(again) <= 2
+
+
+@pytest.mark.parametrize(("shaft_hz", "hz", "mains", "line"), BESIDE)
+def test_a_fault_that_comes_with_a_line_is_named(shaft_hz, hz, mains, line):
+    rows = np.tile(HEALTHY, (HEALTHY_REVOLUTIONS + 600, 1))
+    rows[HEALTHY_REVOLUTIONS:, 0] += 8.0j
+    watch, _ = watched(shaft_hz, line(hz, 8.0), vectors=rows, revolutions=600)
+    found = watch.finish()
+    assert "static_load" in found.group
+    assert found.line.mains == mains
+
+
+@pytest.mark.parametrize(
+    ("shaft_hz", "hz", "line"),
+    [(41.0, 50.0, flat_line), (83.0, 50.0, flat_line), (41.0, 100.0, round_line), (33.0, 50.0, flat_line)],
+)
+def test_a_line_from_the_beginning_hides_no_fault(shaft_hz, hz, line):
+    rows = np.tile(HEALTHY, (HEALTHY_REVOLUTIONS + 400, 1))
+    rows[HEALTHY_REVOLUTIONS:, 0] += 6.0j
+    watch, _ = watched(shaft_hz, line(hz, 9.0), vectors=rows, before=1.0)
+    found = watch.finish()
+    assert "static_load" in found.group
+    assert found.line is None
+
+
+@pytest.mark.parametrize(
+    ("shaft_hz", "order"), [(100.0, 0.5), (120.0, 0.5), (150.0, 1 / 3), (40.0, 1.5), (20.0, 2.5)]
+)
+def test_what_a_rub_leaves_at_a_part_of_the_speed_is_not_called_the_mains(shaft_hz, order):
+    rows = np.tile(HEALTHY, (HEALTHY_REVOLUTIONS + 400, 1))
+    rows[HEALTHY_REVOLUTIONS:, 1] *= 1.2
+    rows[HEALTHY_REVOLUTIONS:, 3] += 2.0
+    watch, _ = watched(shaft_hz, flat_line(order * shaft_hz, 20.0), vectors=rows)
+    found = watch.finish()
+    assert found.line.order == pytest.approx(order, abs=0.002)
+    assert found.line.mains == 0
+    assert not found.by_line
+    assert "the mains have this frequency, too" in found.line.describe()
+
+
+@pytest.mark.parametrize(("shaft_hz", "hz"), [(106.4, 50.04), (133.0, 60.0), (83.0, -50.0)])
+def test_a_whirl_at_their_frequency_is_not_called_the_mains(shaft_hz, hz):
+    watch, _ = watched(shaft_hz, round_line(hz, 30.0))
+    found = watch.finish()
+    assert (found.line.mains, found.line.forward) == (0, hz > 0)
+    assert not found.by_line
+    assert "the mains have this frequency, too" in found.line.describe()
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.2])
+def test_poles_that_pass_modulate_1x_and_are_no_unbalance(phase):
+    whirl = HEALTHY[1]
+
+    def passing(t):
+        swing = np.sin(2.0 * math.pi * 0.8 * t)
+        modulated = (1.0 + 0.3 * swing) * np.exp(1j * phase * swing)
+        return whirl * np.exp(2j * math.pi * TWO_POLE_HZ * t) * (modulated - 1.0)
+
+    watch, reports = watched(TWO_POLE_HZ, passing, revolutions=900)
+    found = watch.finish()
+    assert found.group == ("unmodelled",)
+    assert found.by_line
+    assert (found.line.modulates, found.line.poles) == (1, 2)
+    assert found.line.describe().startswith("1X is modulated at 0.80 Hz since the change, by lines of")
+    assert "as often as the poles of an induction motor of 2 poles pass" in found.line.describe()
+    late = [one for one in reports if one.revolution > HEALTHY_REVOLUTIONS + 350]
+    assert not any(report.departed for report in late)
+
+
+def test_what_is_said_of_a_line():
     watch, _ = watched(TWO_POLE_HZ, flat_line(50.0, 4.0))
     sentence = watch.finish().line.describe()
-    assert "at 50.00 Hz (1.008X) came with the change: the mains, as cables pick them up" in sentence
-    watch, _ = watched(TWO_POLE_HZ, round_line(100.0, 4.0))
-    assert "twice the mains, as an induction motor pulls" in watch.finish().line.describe()
-    watch, _ = watched(TWO_POLE_HZ, round_line(-0.47 * TWO_POLE_HZ, 6.0))
-    assert "X) came with the change: backward, at no harmonic of the shaft" in (
-        watch.finish().line.describe()
+    assert (
+        "at 50.00 Hz (1.008X) came with the change: these are the mains, as cables pick them up" in sentence
     )
+    watch, _ = watched(TWO_POLE_HZ, round_line(100.0, 4.0))
+    assert "it is at twice the mains, as an induction motor pulls" in watch.finish().line.describe()
+    watch, _ = watched(TWO_POLE_HZ, round_line(-0.47 * TWO_POLE_HZ, 6.0))
+    sentence = watch.finish().line.describe()
+    assert "X) came with the change: it goes backward, at no harmonic of the shaft" in sentence
+    assert "mains" not in sentence
 
 
 def test_a_whirl_is_a_line_with_its_sense_and_stays_unmodelled():
@@ -109,7 +203,7 @@ def test_a_whirl_is_a_line_with_its_sense_and_stays_unmodelled():
     assert found.line.forward
     assert found.line.mains == 0
     assert found.line.order == pytest.approx(0.47, abs=0.001)
-    assert not found.line.is_the_change  # what whirls is for a person to say
+    assert not found.by_line  # what whirls is for a person to say
 
 
 def test_more_unbalance_is_no_mains_though_the_shaft_turns_at_their_frequency():
@@ -130,18 +224,6 @@ def test_unbalance_that_grows_is_no_mains(revolutions):
     assert all(one.identification is None or one.identification.line is None for one in reports)
 
 
-def test_a_fault_is_named_beside_a_weaker_line():
-    rows = np.tile(HEALTHY, (HEALTHY_REVOLUTIONS + 400, 1))
-    rows[HEALTHY_REVOLUTIONS:, 1] *= 2.0
-    watch, _ = watched(TWO_POLE_HZ, round_line(150.7, 3.0), vectors=rows)
-    assert watch.finish().line.order == pytest.approx(150.7 / TWO_POLE_HZ, abs=0.001)
-    watch, _ = watched(TWO_POLE_HZ, round_line(100.0, 3.0), vectors=rows)
-    found = watch.finish()
-    assert found.line.mains == 2
-    assert not found.line.is_the_change
-    assert found.evidence["unbalance"] > found.evidence["static_load"]
-
-
 def test_a_line_that_was_there_before_is_no_news():
     rows = np.tile(HEALTHY, (HEALTHY_REVOLUTIONS + 200, 1))
     rows[HEALTHY_REVOLUTIONS:, 1] *= 2.0
@@ -149,17 +231,6 @@ def test_a_line_that_was_there_before_is_no_news():
     assert watch.finish().line is None
     watch, _ = watched(24.7, round_line(35.0, 3.0), revolutions=200, vectors=rows)
     assert watch.finish().line.frequency_hz == pytest.approx(35.0, abs=0.05)
-
-
-def test_what_modulates_1x_is_no_line_beside_it():
-    def hunting(t):
-        whirl = abs(HEALTHY[1]) * np.exp(2j * math.pi * TWO_POLE_HZ * t)
-        return 0.4 * np.sin(2.0 * math.pi * 0.9 * t) * whirl
-
-    watch, _ = watched(TWO_POLE_HZ, hunting)
-    found = watch.finish()
-    assert found is not None
-    assert found.line is None
 
 
 def test_a_speed_that_is_only_stated_makes_no_line_of_1x():
@@ -291,11 +362,16 @@ def test_a_recording_of_hum_is_told_as_hum(hum, capsys):
     assert line["frequency_hz"] == pytest.approx(49.99, abs=0.02)
     assert line["order"] == pytest.approx(49.99 / TWO_POLE_HZ, abs=0.001)
     assert line["mains"] == 1
-    assert line["forward"] in {True, False}
+    assert line["forward"] is None
+    assert line["is_the_change"] is True
     assert document["level"]["unmodelled"]["nonsynchronous_um"] == pytest.approx(
         line["amplitude_um"] / math.sqrt(2.0), rel=0.01
     )
     assert main(hum) == 0
     output = capsys.readouterr().out
     assert "hum.npz: unmodelled (above 99.9 %)" in output
-    assert "um at 49.99 Hz (1.008X) came with the change: the mains, as cables pick them up" in output
+    assert "um at 49.99 Hz (1.008X) came with the change: these are the mains, as cables pick" in output
+    assert "pick them up; no fault of the rotor" in output
+    # Without a mean position rub and unmodelled changes are one group, but this is none of them.
+    assert main([*hum, "--ac-coupled", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["group"] == ["unmodelled"]

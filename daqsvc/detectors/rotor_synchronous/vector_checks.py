@@ -97,9 +97,10 @@ class VectorChecks:
         steady = max(radii) < _STEADY * min(radii) + spread
         if min(radii) > spread and abs(sum(turned)) / 2.0 > spread / min(radii) and not uneven and steady:
             if turned[0] * turned[1] > 0.0 and abs(slip) > _SLIP:
+                way = "faster" if slip > 0.0 else "slower"
                 return (
                     f"the angle is no longer locked to the shaft: 1X turns by {360.0 * slip:+.2g} degrees a "
-                    f"revolution, so the shaft turns {100.0 * slip:+.2g} % faster than "
+                    f"revolution, so the shaft turns {100.0 * abs(slip):.2g} % {way} than "
                     f"{calibration.speed_rpm:.1f} rpm; use a keyphasor, or calibrate at the present speed"
                 )
             return ""

@@ -112,15 +112,21 @@ class LineJson(TypedDict):
         frequency_hz: where it is.
         order: the same per revolution of the shaft.
         amplitude_um: root mean square radius of its motion.
-        forward: whether the shaft goes around more with its rotation than against it.
-        mains: 1 at the frequency of the mains, 2 at twice that; 0 elsewhere.
+        forward: whether the shaft goes around with its rotation or against it; null if it goes to and fro.
+        mains: 1 if cables pick up the mains, 2 if it is twice the mains; 0 otherwise.
+        modulates: harmonic that has such a line on either side; null if it is alone.
+        poles: of the induction motor whose poles pass as often as the harmonic is modulated; null if unknown.
+        is_the_change: whether nothing else has changed, so that no fault is named.
     """
 
     frequency_hz: float
     order: float
     amplitude_um: float
-    forward: bool
+    forward: bool | None
     mains: int
+    modulates: int | None
+    poles: int | None
+    is_the_change: bool
 
 
 class RotorVerdictJson(TypedDict):
@@ -337,11 +343,6 @@ class RotorVerdict(Verdict):
         """The verdict about a recording that cannot be judged."""
         return cls(recording=recording, quality=quality or DataQuality(0), refused=why)
 
-    @property
-    def line(self) -> NonsynchronousLine | None:
-        """That came with the change beside the shaft's harmonics; None if none stands out."""
-        return None if self.identification is None else self.identification.line
-
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite, lengths in um."""
         change = None if self.identification is None else self.identification.change
@@ -362,7 +363,7 @@ class RotorVerdict(Verdict):
                 str(order): [value.real, value.imag]
                 for order, value in zip(HARMONICS, change.tolist(), strict=True)
             },
-            "line": None if self.line is None else _line_json(self.line),
+            "line": self._line(),
             "onset": _json_of(self.onset),
             "departure": _json_of(self.departure),
             "declaration": _json_of(self.declaration),
@@ -392,8 +393,10 @@ class RotorVerdict(Verdict):
             lines += [alarm.describe() for alarm in self.alarms]
         if self.identification is not None and self.calibration is not None:
             lines.append(self._change())
-            if self.line is not None:
-                lines.append(self.line.describe())
+            if (line := self.identification.line) is not None:
+                lines.append(
+                    line.describe() + ("; no fault of the rotor" if self.identification.by_line else "")
+                )
             lines += [
                 f"{words(fault)}: {', '.join(_figure(key, value) for key, value in level.items())}"
                 for fault, level in self.level.items()
@@ -449,6 +452,10 @@ class RotorVerdict(Verdict):
             modes += f" ({_percent(chance)})"
         return modes
 
+    def _line(self) -> LineJson | None:
+        now = self.identification
+        return None if now is None or now.line is None else _line_json(now.line, is_the_change=now.by_line)
+
     def _named(self) -> str:
         return f"; named at {place_of(self.declaration)}" if self.declaration is not None else "; not named"
 
@@ -494,13 +501,16 @@ def _json_of(instant: Instant | None) -> InstantJson | None:
     return None if instant is None else instant.as_json()
 
 
-def _line_json(line: NonsynchronousLine) -> LineJson:
+def _line_json(line: NonsynchronousLine, *, is_the_change: bool) -> LineJson:
     return {
         "frequency_hz": line.frequency_hz,
         "order": line.order,
         "amplitude_um": line.amplitude_um,
         "forward": line.forward,
         "mains": line.mains,
+        "modulates": line.modulates,
+        "poles": line.poles,
+        "is_the_change": is_the_change,
     }
 
 

@@ -232,6 +232,21 @@ def compensated(
     return moved, terms
 
 
+def at_speed(vector: Complexes, terms: Floats, healthy: Calibration) -> Complexes:
+    """One vector brought to the speed of the healthy machine, complex128 ``[5]``; see `compensated`.
+
+    Args:
+        vector: complex128 ``[5]``, um.
+        terms: float64 ``[3]``, its `speed_terms`.
+        healthy: the machine.
+    """
+    slope, _ = healthy.rotor.speed_slope(healthy.speed_rad_s)
+    moved = vector.copy()
+    moved[FORWARD] /= 1.0 + slope * terms[0]
+    moved[BACKWARD] /= 1.0 + slope.conjugate() * terms[0]
+    return moved if healthy.law is None else np.asarray(moved - healthy.law.predicted_um(terms))
+
+
 def calibrate(
     vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float, *, angle_assumed: bool = True
 ) -> Calibration:

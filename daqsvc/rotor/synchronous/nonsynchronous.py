@@ -1,22 +1,24 @@
-"""A line beside the shaft's harmonics that came with a change: where it is, and whether it is the mains'.
+"""A line beside the shaft's harmonics that came with a change, and what the change is without it.
 
 A revolution's synchronous vector cannot tell a line that is near a harmonic from that harmonic. Cables pick
-up the mains, and an induction motor pulls at twice their frequency. Either may beat with 1X or 2X: for a
-part of the beat 1X looks like that of another unbalance. Many revolutions together show the line by itself.
+up the mains, an induction motor pulls at twice their frequency, its poles pass a rotor bar and modulate 1X,
+another machine shakes the ground. Any of these may beat with 1X, which looks like that of another unbalance
+for a part of the beat. Many revolutions together show the line by itself, and the harmonics without it.
 
-A line at twice the mains: Randall, Vibration-based Condition Monitoring (2nd ed. 2021), section 2.4.
+Lines of motors: Randall, Vibration-based Condition Monitoring (2nd ed. 2021), section 2.4.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections import deque
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.fft
 
+from daqsvc.rotor.synchronous.positions import REVOLUTIONS, LastPositions
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
@@ -25,23 +27,28 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.positions import Stretch
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
 Mains: TypeAlias = Literal[0, 1, 2]
 """A line at the frequency of the mains, or at twice that; 0: at neither."""
-REVOLUTIONS = 512
-"""Revolutions that are kept: a line 1 % beside a harmonic is five bins away from it then."""
 LEAST_REVOLUTIONS = 64
+EVERY = 16
+"""Revolutions from one evaluation to the next, at least."""
 _SETTLING = 8
 """Revolutions after a change in which the rotor is on its way."""
-_EVERY = 16
-"""Revolutions from one evaluation to the next, at least."""
-_POINTS_PER_REV = 32
 _HIGHEST = 6
-"""Harmonics that are taken out; lines are looked for up to this order, and that of twice the mains."""
-_MOST_MISSING = 0.2
+"""Harmonics that are taken out; lines are looked for up to the next one, and twice the mains anywhere."""
+_JUDGED = (1, 2, 3)
+"""Harmonics that a rotor is judged by."""
+_NEAR = 1.0 / 16.0
+"""Orders from one of them within which a line beats so slowly that its revolutions are not alike."""
+_BEATS = 2.0
+"""Beats over which line and harmonic are told apart well."""
+_DIVISORS = (2, 3, 4)
+"""A rub leaves lines at these parts of the speed."""
 _MAINS_HZ = (50.0, 60.0)
 _GRID_SHARE = 0.002
 """How far a grid's frequency may be off."""
@@ -59,9 +66,15 @@ _ANY_LINE_DB = 20.0
 """... and one that is anywhere."""
 _SHARP_DB = 6.0
 _MIRROR_DB = 6.0
-"""What modulates a harmonic leaves lines on either side of it, as a speed that hunts does."""
+"""What modulates a harmonic leaves lines on either side of it."""
 _NEW = 4.0
 """Power of a line over what was there before, from which on it came with the change."""
+_FLAT = 0.8
+"""Smaller over larger of both senses, from which on a motion is a line in the plane."""
+_OIL_WHIRL = (0.35, 0.5)
+"""Orders of a whirl of oil films."""
+_MOST_OF_CLEARANCE = 0.5
+"""No mains move a signal by more than this part of the clearance."""
 _GRID_STEPS = 9
 _LEAST_OVER_NOISE = 30.0
 _ALL_OF_IT = 0.9
@@ -69,8 +82,8 @@ _ALL_OF_IT = 0.9
 _NOT_STEADY = 0.8
 """... and the part of theirs that a steady orbit may explain then: what grows evenly is steady by 3/4, and is
 explained by a line by no more than that."""
-_EXPLAINED = 0.5
-"""Part of all new motion that a line must be to be what has changed."""
+_MOST_SLIP = 0.08
+_MOST_POLE_PAIRS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,130 +94,75 @@ class NonsynchronousLine:
         frequency_hz: where it is.
         order: the same per revolution of the shaft.
         amplitude_um: square root of the mean square radius of its motion; of a round orbit the radius.
-        forward: whether the shaft goes around more with its rotation than against it.
-        mains: 1 at the frequency of the mains, 2 at twice that; 0 elsewhere.
-        share: of all that moves otherwise than before, as mean squares.
+        forward: whether the shaft goes around with its rotation or against it; None if it goes to and fro.
+        mains: 1 if cables pick up the mains, 2 if it is twice the mains; 0 otherwise.
+        modulates: harmonic that has such a line on either side; None if it is alone.
+        poles: of the induction motor whose poles pass as often as the harmonic is modulated; None if unknown.
+        share: of all that moves beside the harmonics and did not before, as mean squares.
     """
 
     frequency_hz: float
     order: float
     amplitude_um: float
-    forward: bool
-    mains: Mains
-    share: float
+    forward: bool | None
+    mains: Mains = 0
+    modulates: int | None = None
+    poles: int | None = None
+    share: float = 1.0
 
     @property
-    def is_the_change(self) -> bool:
-        """Whether the mains are all that has changed."""
-        return self.mains > 0 and self.share > _EXPLAINED
+    def beats(self) -> bool:
+        """Whether it is so near a judged harmonic that the revolutions differ for many in turn."""
+        nearest = round(self.order)
+        return nearest in _JUDGED and abs(self.order - nearest) < _NEAR
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether it is none of the rotor's: of the mains, or one that beats with a harmonic."""
+        return self.mains > 0 or self.beats
 
     def describe(self) -> str:
         """One sentence for a person."""
-        sense = "forward" if self.forward else "backward"
-        line = f"a line of {self.amplitude_um:.3g} um at {self.frequency_hz:.2f} Hz"
+        if self.modulates is not None:
+            return self._modulation(self.modulates)
+        line = f"a line of {self.amplitude_um:.3g} um at {self.frequency_hz:.2f} Hz ({self.order:.4g}X)"
         if self.mains == 2:
-            what = "twice the mains, as an induction motor pulls"
+            what = "it is at twice the mains, as an induction motor pulls"
         elif self.mains:
-            what = "the mains, as cables pick them up"
+            what = "these are the mains, as cables pick them up"
         else:
-            what = f"{sense}, at no harmonic of the shaft"
-        return f"{line} ({self.order:.4g}X) came with the change: {what}"
+            sense = {True: "forward", False: "backward", None: "to and fro"}[self.forward]
+            what = f"it goes {sense}, at no harmonic of the shaft"
+            if any(_is_mains(self.frequency_hz, hz) for hz, _ in _mains()):
+                what += "; the mains have this frequency, too"
+        return f"{line} came with the change: {what}"
+
+    def _modulation(self, harmonic: int) -> str:
+        often_hz = abs(self.frequency_hz - harmonic * self.frequency_hz / self.order)
+        sentence = (
+            f"{harmonic}X is modulated at {often_hz:.2f} Hz since the change, by lines of "
+            f"{self.amplitude_um:.3g} um on either side"
+        )
+        if self.poles is not None:
+            sentence += (
+                f": as often as the poles of an induction motor of {self.poles} poles pass its rotor bars"
+            )
+        return sentence
 
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
-    """Positions of the shaft over some revolutions, at even times.
+class Found(NamedTuple):
+    """What a search has found.
 
     Attributes:
-        z: complex128 ``[n]``, um; 0 where missing.
-        turns: float64 ``[n]``, shaft angle in revolutions.
-        there: bool ``[n]``.
-        rate_hz: of the positions.
-        averaged: samples in each.
+        line: the line.
+        harmonics: complex128 ``[5]``, synchronous vector without it, um; None where it does not beat with it,
+            or nothing else has changed.
+        revolutions: that show this.
     """
 
-    z: Complexes
-    turns: Floats
-    there: NDArray[np.bool_]
-    rate_hz: float
-    averaged: int
-
-    @property
-    def revolutions(self) -> float:
-        """How far the shaft turned."""
-        known = self.turns[self.there]
-        return float(known[-1] - known[0]) if len(known) else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    """Positions of one revolution: ``z`` is NaN where missing."""
-
-    revolution: int
-    first: int
-    z: NDArray[np.complex64]
-    turns: Floats
-
-
-class LastPositions:
-    """The shaft's positions in the last revolutions, some 32 in each.
-
-    Args:
-        rate_hz: sampling rate.
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self._rate_hz = rate_hz
-        self._averaged = 0
-        self._kept: deque[_Kept] = deque(maxlen=REVOLUTIONS)
-        self._next = -1
-        self._rest_z: Complexes = np.empty(0, dtype=np.complex128)
-        self._rest_turns: Floats = np.empty(0)
-
-    def add(self, revolution: int, first_index: int, turns: Floats, z: Complexes) -> None:
-        """Keep a revolution.
-
-        Args:
-            revolution: its number.
-            first_index: of its first sample.
-            turns: float64 ``[n]``, shaft angle in revolutions from its beginning.
-            z: complex128 ``[n]``, um; NaN where missing.
-        """
-        if not self._averaged:
-            self._averaged = max(1, len(z) // _POINTS_PER_REV)
-        if first_index != self._next:
-            self._rest_z, self._rest_turns = self._rest_z[:0], self._rest_turns[:0]
-        self._next = first_index + len(z)
-        first = first_index - len(self._rest_z)
-        z = np.concatenate((self._rest_z, z))
-        turns = np.concatenate((self._rest_turns, revolution + turns))
-        # Positions lie on one grid, over gaps as well.
-        skip = -first % self._averaged
-        whole = max(0, len(z) - skip) // self._averaged * self._averaged
-        self._rest_z, self._rest_turns = z[skip + whole :], turns[skip + whole :]
-        if not whole:
-            return
-        means = z[skip : skip + whole].reshape(-1, self._averaged).mean(axis=1)
-        at = turns[skip : skip + whole].reshape(-1, self._averaged).mean(axis=1)
-        first = (first + skip) // self._averaged
-        self._kept.append(_Kept(revolution, first, means.astype(np.complex64), at))
-
-    def stretch(self, begin: int, end: int) -> Stretch | None:
-        """The revolutions from one up to before another; None if too much is missing."""
-        kept = [one for one in self._kept if begin <= one.revolution < end]
-        if not kept:
-            return None
-        first = kept[0].first
-        z = np.full(kept[-1].first + len(kept[-1].z) - first, np.nan, dtype=np.complex128)
-        turns = np.zeros(len(z))
-        for one in kept:
-            part = slice(one.first - first, one.first - first + len(one.z))
-            z[part], turns[part] = one.z, one.turns
-        there = np.isfinite(z)
-        if there.mean() < 1.0 - _MOST_MISSING:
-            return None
-        z[~there] = 0.0
-        return Stretch(z, turns, there, self._rate_hz / self._averaged, self._averaged)
+    line: NonsynchronousLine
+    harmonics: Complexes | None
+    revolutions: int
 
 
 class _Spectrum:
@@ -215,17 +173,14 @@ class _Spectrum:
     """
 
     def __init__(self, stretch: Stretch) -> None:
-        turning = np.exp(2j * math.pi * stretch.turns)
-        orders = range(-_HIGHEST, _HIGHEST + 1)
-        basis = np.stack([turning**k for k in orders], axis=1) * stretch.there[:, np.newaxis]
-        fit = np.linalg.solve(basis.conj().T @ basis, basis.conj().T @ stretch.z)
+        basis = _harmonics(stretch) * stretch.there[:, np.newaxis]
+        fit = _fitted(basis, stretch.z)
         window = np.hanning(len(stretch.z) + 1)[:-1] * stretch.there
-        sides = scipy.fft.fft((stretch.z - basis @ fit) * window)
-        sides = np.abs(sides) ** 2 / (_WINDOW_BINS * max(float(window.sum()) ** 2, 1.0))
+        left = scipy.fft.fft((stretch.z - basis @ fit) * window)
+        sides: Floats = np.abs(left) ** 2 / (_WINDOW_BINS * max(float(window.sum()) ** 2, 1.0))
         self.step_hz = stretch.rate_hz / len(stretch.z)
         count = len(sides) // 2
-        self.forward, self.backward = sides[:count], np.roll(sides[::-1], 1)[:count]
-        self.power = self.forward + self.backward
+        self.power = sides[:count] + np.roll(sides[::-1], 1)[:count]
 
     def peak(self, low_hz: float, high_hz: float) -> int:
         """The strongest bin between two frequencies; 0 if there is none."""
@@ -248,10 +203,9 @@ class _Spectrum:
         top = self.power[at - 1 : at + 2].argmax() == 1
         return bool(top and self.power[at] > 10.0 ** (0.1 * _SHARP_DB) * np.quantile(skirt, 0.75))
 
-    def line(self, at: int, power: Floats | None = None) -> float:
+    def line(self, at: int) -> float:
         """Mean square of the line whose top is in a bin."""
-        power = self.power if power is None else power
-        return float(power[max(at - _CORE_BINS, 1) : at + _CORE_BINS + 1].sum())
+        return float(self.power[max(at - _CORE_BINS, 1) : at + _CORE_BINS + 1].sum())
 
     def exact_hz(self, at: int) -> float:
         """Where a line is between the bins, by its neighbours."""
@@ -264,9 +218,20 @@ class _Spectrum:
         return self.line(at) if at else 0.0
 
 
+def _harmonics(stretch: Stretch) -> Complexes:
+    """Harmonics of the shaft, complex128 ``[n, 2 H + 1]``, from the most backward one to the most forward."""
+    turning = np.exp(2j * math.pi * stretch.turns)
+    return np.stack([turning**k for k in range(-_HIGHEST, _HIGHEST + 1)], axis=1)
+
+
+def _fitted(basis: Complexes, z: Complexes) -> Complexes:
+    """Least-squares coefficients of columns that are nearly orthogonal."""
+    return np.asarray(np.linalg.solve(basis.conj().T @ basis, basis.conj().T @ z))
+
+
 def new_line(
     now: Stretch, before: Stretch | None, healthy: Calibration, speed_uncertainty: float = 0.0
-) -> NonsynchronousLine | None:
+) -> Found | None:
     """The line beside the harmonics that came with a change: that of the mains, or else the strongest.
 
     Args:
@@ -275,50 +240,114 @@ def new_line(
         healthy: its baseline.
         speed_uncertainty: relative standard deviation of the speed: a line as near to a harmonic may be it.
     """
-    found = _new_line(now, before, healthy)
+    if before is not None and before.revolutions < LEAST_REVOLUTIONS / 4:
+        before = None
+    shaft_hz = now.revolutions * now.rate_hz / float(np.ptp(np.flatnonzero(now.there)))
+    found = None
+    if now.revolutions >= LEAST_REVOLUTIONS:
+        found = _standing_out(now, before, shaft_hz, healthy)
+    if found is None:
+        found = _mains_in_a_beat(now, before, shaft_hz, healthy)
     if found is None:
         return None
-    apart = abs(found.order - round(found.order))
-    return found if apart > _DEVIATIONS * speed_uncertainty * found.order else None
-
-
-def _new_line(now: Stretch, before: Stretch | None, healthy: Calibration) -> NonsynchronousLine | None:
-    shaft_hz = now.revolutions * now.rate_hz / float(np.ptp(np.flatnonzero(now.there)))
-    motion = _Motion(now, healthy)
-    if now.revolutions >= LEAST_REVOLUTIONS:
-        earlier = None if before is None or before.revolutions < LEAST_REVOLUTIONS / 4 else _Spectrum(before)
-        found = _standing_out(_Spectrum(now), earlier, shaft_hz, motion)
-        if found is not None:
-            return found
-    return motion.of_mains(shaft_hz)
+    order = found.line.order
+    return found if abs(order - round(order)) > _DEVIATIONS * speed_uncertainty * order else None
 
 
 def _standing_out(
-    spectrum: _Spectrum, earlier: _Spectrum | None, shaft_hz: float, motion: _Motion
-) -> NonsynchronousLine | None:
-    """The line of a spectrum that stands alone and is new; None if there is none."""
-    candidates: list[tuple[int, Mains, float]] = [(_strongest(spectrum, shaft_hz), 0, _ANY_LINE_DB)]
-    for hz, mains in _mains():
+    now: Stretch, before: Stretch | None, shaft_hz: float, healthy: Calibration
+) -> Found | None:
+    """The line of the spectrum that is new and at no harmonic; None if there is none."""
+    spectrum = _Spectrum(now)
+    earlier = None if before is None else _Spectrum(before)
+    candidates = [(_strongest(spectrum, shaft_hz), _ANY_LINE_DB, 1.0)]
+    for hz, _ in _mains():
         reach_hz = max(_GRID_SHARE * hz, spectrum.step_hz)
-        candidates.append((spectrum.peak(hz - reach_hz, hz + reach_hz), mains, _LINE_DB))
-    found = [
-        (spectrum.line(at), at, mains)
-        for at, mains, least_db in candidates
-        if at and _stands_alone(spectrum, at, shaft_hz, least_db) and _is_new(spectrum, at, earlier)
-    ]
-    if not found:
+        # The mains are among the strongest themselves where they are it.
+        candidates.append((spectrum.peak(hz - reach_hz, hz + reach_hz), _LINE_DB, 2.0))
+    best, at, modulates = 0.0, 0, None
+    for peak, least_db, weight in candidates:
+        if not peak or not _stands_out(spectrum, peak, shaft_hz, least_db):
+            continue
+        if not _is_new(spectrum, peak, earlier):
+            continue
+        mirrored = _mirrored(spectrum, peak, shaft_hz)
+        harmonic = round(peak * spectrum.step_hz / shaft_hz)
+        if mirrored and not (harmonic in _JUDGED and _is_near(peak * spectrum.step_hz / shaft_hz)):
+            continue
+        if weight * spectrum.line(peak) > best:
+            best, at, modulates = weight * spectrum.line(peak), peak, harmonic if mirrored else None
+    if not at:
         return None
-    # The mains are among the strongest themselves where they are it.
-    square, at, mains = max(found, key=lambda one: one[0] * (2.0 if one[2] else 1.0))
     frequency_hz = spectrum.exact_hz(at)
-    return NonsynchronousLine(
-        frequency_hz=frequency_hz,
-        order=frequency_hz / shaft_hz,
-        amplitude_um=math.sqrt(square),
-        forward=spectrum.line(at, spectrum.forward) >= spectrum.line(at, spectrum.backward),
-        mains=mains,
-        share=min(1.0, square / motion.square),
-    )
+    return _described(now, frequency_hz, shaft_hz, healthy, modulates)
+
+
+def _described(
+    now: Stretch, frequency_hz: float, shaft_hz: float, healthy: Calibration, modulates: int | None
+) -> Found:
+    """A line of this frequency, and the harmonics without it."""
+    order = frequency_hz / shaft_hz
+    near = _is_near(order)
+    shown_rev = float(LEAST_REVOLUTIONS)
+    if near:
+        shown_rev = max(shown_rev, _BEATS / abs(order - round(order)))
+    part = now.last(shown_rev)
+    frequencies = [frequency_hz]
+    if modulates is not None:
+        frequencies.append(2.0 * modulates * shaft_hz - frequency_hz)
+    seconds = np.arange(len(part.z)) / part.rate_hz
+    going = [np.exp(2j * math.pi * sign * hz * seconds) for hz in frequencies for sign in (1.0, -1.0)]
+    basis = np.column_stack((_harmonics(part), *going)) * part.there[:, np.newaxis]
+    fit = _fitted(basis, part.z)
+    forward, backward = (float(abs(each)) for each in fit[2 * _HIGHEST + 1 :][:2])
+    harmonics = fit[[_HIGHEST + k for k in HARMONICS]]
+    amplitude_um = math.sqrt(float((np.abs(fit[2 * _HIGHEST + 1 :]) ** 2).sum()))
+    left = (part.z - basis @ fit)[part.there]
+    others = max(float((np.abs(left) ** 2).mean()) - healthy.noise / part.averaged, 0.0)
+    share = amplitude_um**2 / (amplitude_um**2 + others)
+    line = NonsynchronousLine(frequency_hz, order, amplitude_um, _sense(forward, backward), share=share)
+    if modulates is None:
+        line = replace(line, mains=_mains_in(line, now.revolutions, healthy))
+    else:
+        often_hz = abs(frequency_hz - modulates * shaft_hz)
+        line = replace(line, modulates=modulates, poles=_poles(often_hz, shaft_hz, now.revolutions))
+    return Found(line, harmonics if near else None, round(part.revolutions))
+
+
+def _sense(forward: float, backward: float) -> bool | None:
+    """Whether a motion is forward; None where it goes to and fro."""
+    return None if min(forward, backward) > _FLAT * max(forward, backward) else forward > backward
+
+
+def _mains_in(line: NonsynchronousLine, revolutions: float, healthy: Calibration) -> Mains:
+    """Whether a line is of the mains: it is where they are, and nothing of the rotor can be it."""
+    mains: Mains = next((m for hz, m in _mains() if _is_mains(line.frequency_hz, hz)), 0)
+    clearance_um, order = healthy.rotor.clearance_um, line.order
+    if clearance_um is not None and line.amplitude_um > _MOST_OF_CLEARANCE * clearance_um:
+        return 0
+    # What a rub leaves at a part of the speed may be at the mains by chance.
+    parts = (abs(order - round(order * n) / n) for n in _DIVISORS)
+    if not _is_near(order) and any(part * revolutions < _APART_BINS for part in parts):
+        return 0
+    if line.forward is None:
+        return mains
+    # Cables give all probes the same, so that the orbit is a line.
+    return mains if mains != 1 and not _OIL_WHIRL[0] < order < _OIL_WHIRL[1] else 0
+
+
+def _poles(often_hz: float, shaft_hz: float, revolutions: float) -> int | None:
+    """Poles of an induction motor at this speed that pass its rotor bars so often; None if there is none."""
+    resolution_hz = shaft_hz / max(revolutions, 1.0)
+    for mains_hz, pairs in itertools.product(_MAINS_HZ, range(1, _MOST_POLE_PAIRS + 1)):
+        slip_hz = mains_hz / pairs - shaft_hz
+        if not 0.0 < slip_hz < _MOST_SLIP * shaft_hz:
+            continue
+        # The poles pass at twice the slip of every pole pair; the slip is as exact as the mains.
+        allowed_hz = 2.0 * _GRID_SHARE * mains_hz + resolution_hz
+        if abs(often_hz - 2.0 * pairs * slip_hz) < allowed_hz:
+            return 2 * pairs
+    return None
 
 
 def _mains() -> Iterator[tuple[float, Mains]]:
@@ -328,25 +357,36 @@ def _mains() -> Iterator[tuple[float, Mains]]:
         yield 2.0 * mains_hz, 2
 
 
+def _is_mains(frequency_hz: float, mains_hz: float) -> bool:
+    return abs(frequency_hz - mains_hz) < 1.5 * _GRID_SHARE * mains_hz
+
+
+def _is_near(order: float) -> bool:
+    """Whether a line beats with a judged harmonic."""
+    return round(order) in _JUDGED and abs(order - round(order)) < _NEAR
+
+
 def _strongest(spectrum: _Spectrum, shaft_hz: float) -> int:
     """The strongest bin that is beside the harmonics."""
-    bins = np.arange(len(spectrum.power))
-    orders = bins * (spectrum.step_hz / shaft_hz)
+    orders = np.arange(len(spectrum.power)) * (spectrum.step_hz / shaft_hz)
     beside = np.abs(orders - np.round(orders)) * shaft_hz > _APART_BINS * spectrum.step_hz
-    power = np.where(beside & (orders < _HIGHEST + 1.0), spectrum.power, 0.0)
-    return int(power.argmax())
+    return int(np.where(beside & (orders < _HIGHEST + 1.0), spectrum.power, 0.0).argmax())
 
 
-def _stands_alone(spectrum: _Spectrum, at: int, shaft_hz: float, least_db: float) -> bool:
-    """Whether a bin is a line by itself: sharp, at no harmonic, and none of a pair about one."""
+def _stands_out(spectrum: _Spectrum, at: int, shaft_hz: float, least_db: float) -> bool:
+    """Whether a bin is a sharp line at no harmonic."""
     per_rev = shaft_hz / spectrum.step_hz
-    nearest = round(at / per_rev) * per_rev
-    if abs(at - nearest) < _APART_BINS or spectrum.level_db(at) < least_db or not spectrum.is_sharp(at):
+    apart = abs(at - round(at / per_rev) * per_rev)
+    return apart >= _APART_BINS and spectrum.level_db(at) >= least_db and spectrum.is_sharp(at)
+
+
+def _mirrored(spectrum: _Spectrum, at: int, shaft_hz: float) -> bool:
+    """Whether a harmonic has as strong a line on its other side."""
+    per_rev = shaft_hz / spectrum.step_hz
+    mirror = round(2.0 * round(at / per_rev) * per_rev - at)
+    if not 1 <= mirror < len(spectrum.power) - 1:
         return False
-    mirrored = round(2.0 * nearest - at)
-    if not 1 <= mirrored < len(spectrum.power) - 1:
-        return True
-    return bool(spectrum.line(mirrored) < 10.0 ** (-0.1 * _MIRROR_DB) * spectrum.line(at))
+    return bool(spectrum.line(mirror) > 10.0 ** (-0.1 * _MIRROR_DB) * spectrum.line(at))
 
 
 def _is_new(spectrum: _Spectrum, at: int, earlier: _Spectrum | None) -> bool:
@@ -357,65 +397,65 @@ def _is_new(spectrum: _Spectrum, at: int, earlier: _Spectrum | None) -> bool:
     return bool(spectrum.line(at) > _NEW * before)
 
 
-class _Motion:
-    """How a shaft moves otherwise than it did when it was healthy.
+def _mains_in_a_beat(
+    now: Stretch, before: Stretch | None, shaft_hz: float, healthy: Calibration
+) -> Found | None:
+    """The mains beside a harmonic, before a spectrum tells them apart; None if it is not them.
+
+    Their frequency is known. So a part of a beat is enough, if they are nearly all of the new motion and no
+    steady orbit is.
 
     Args:
-        now: its positions.
-        healthy: its baseline.
+        now: the machine since the change.
+        before: the machine before it; None if not known.
+        shaft_hz: revolutions per second.
+        healthy: the baseline.
     """
+    off = _off_orbit(now, healthy)
+    count = int(now.there.sum())
+    noise = healthy.noise / now.averaged
+    moves = max(float((np.abs(off) ** 2).sum()) / count - noise, 1e-12)
+    best, best_hz = 0.0, 0.0
+    mains: Mains = 0
+    for hz, which in _mains():
+        if not _is_near(hz / shaft_hz):
+            continue
+        for share in np.linspace(-_GRID_SHARE, _GRID_SHARE, _GRID_STEPS):
+            square = float((np.abs(_sides(now, off, hz * (1.0 + share))) ** 2).sum())
+            if square > best:
+                best, best_hz, mains = square, hz * (1.0 + share), which
+    steady = float((np.abs(_harmonics(now).conj().T @ off / count) ** 2).sum())
+    loud = best > _LEAST_OVER_NOISE * noise / count
+    if not loud or best < _ALL_OF_IT * moves or steady > _NOT_STEADY * best:
+        return None
+    if before is None:
+        was = healthy.noise
+    else:
+        was = float((np.abs(_sides(before, _off_orbit(before, healthy), best_hz)) ** 2).sum())
+    forward, backward = (float(abs(each)) for each in _sides(now, off, best_hz))
+    if best < _NEW * was or (mains == 1 and _sense(forward, backward) is not None):
+        return None
+    line = NonsynchronousLine(
+        frequency_hz=best_hz,
+        order=best_hz / shaft_hz,
+        amplitude_um=math.sqrt(best),
+        forward=_sense(forward, backward),
+        mains=mains,
+    )
+    return Found(line, None, round(now.revolutions))
 
-    def __init__(self, now: Stretch, healthy: Calibration) -> None:
-        turning = np.exp(2j * math.pi * now.turns)
-        orbit = np.stack([turning**k for k in HARMONICS], axis=1) @ healthy.baseline
-        self._off = np.where(now.there, now.z - orbit, 0.0)
-        self._turning, self._rate_hz = turning, now.rate_hz
-        self._count = int(now.there.sum())
-        self._noise = healthy.noise / now.averaged
-        square = float((np.abs(self._off) ** 2).sum()) / self._count - self._noise
-        self.square = max(square, 1e-12)
-        """Mean square of the positions off the healthy orbit, without the healthy noise, um^2."""
 
-    def of_mains(self, shaft_hz: float) -> NonsynchronousLine | None:
-        """The mains, if they are nearly all of the motion and no steady orbit is; None if not.
+def _off_orbit(stretch: Stretch, healthy: Calibration) -> Complexes:
+    """Positions off the healthy orbit, complex128 ``[n]``, um; 0 where missing."""
+    columns = [_HIGHEST + k for k in HARMONICS]
+    return np.where(stretch.there, stretch.z - _harmonics(stretch)[:, columns] @ healthy.baseline, 0.0)
 
-        A part of a beat tells them from 1X, as their frequency is known.
 
-        Args:
-            shaft_hz: revolutions per second.
-        """
-        seconds = np.arange(len(self._off)) / self._rate_hz
-        best = (0.0, 0.0, 0j, 0j)
-        at: Mains = 1
-        for hz, mains in _mains():
-            if hz > 0.4 * self._rate_hz:
-                continue
-            for share in np.linspace(-_GRID_SHARE, _GRID_SHARE, _GRID_STEPS):
-                going = np.exp(2j * math.pi * hz * (1.0 + share) * seconds)
-                forward = complex(np.vdot(going, self._off)) / self._count
-                backward = complex(np.vdot(going.conj(), self._off)) / self._count
-                square = abs(forward) ** 2 + abs(backward) ** 2
-                if square > best[0]:
-                    best, at = (square, hz * (1.0 + share), forward, backward), mains
-        square, hz, forward, backward = best
-        loud = square > _LEAST_OVER_NOISE * self._noise / self._count
-        if not loud or square < _ALL_OF_IT * self.square or self._steady() > _NOT_STEADY * square:
-            return None
-        return NonsynchronousLine(
-            frequency_hz=hz,
-            order=hz / shaft_hz,
-            amplitude_um=math.sqrt(square),
-            forward=abs(forward) >= abs(backward),
-            mains=at,
-            share=min(1.0, square / self.square),
-        )
-
-    def _steady(self) -> float:
-        """What harmonics of the shaft that do not change explain of the motion, um^2."""
-        return sum(
-            abs(complex(np.vdot(self._turning**k, self._off)) / self._count) ** 2
-            for k in range(-_HIGHEST, _HIGHEST + 1)
-        )
+def _sides(stretch: Stretch, off: Complexes, hz: float) -> Complexes:
+    """Amplitude of a motion at one frequency, complex128 ``[2]``: forward and backward, um."""
+    going = np.exp(2j * math.pi * hz * np.arange(len(off)) / stretch.rate_hz)
+    count = int(stretch.there.sum())
+    return np.array([np.vdot(going, off) / count, np.vdot(going.conj(), off) / count])
 
 
 class NonsynchronousSearch:
@@ -432,24 +472,21 @@ class NonsynchronousSearch:
         self._before: Stretch | None = None
         self._since: int | None = None
         self._next = 0
-        self._line: NonsynchronousLine | None = None
+        self._found: Found | None = None
 
     def add(self, revolution: int, first_index: int, turns: Floats, z: Complexes) -> None:
         """Keep a revolution; see `LastPositions.add`."""
         self._positions.add(revolution, first_index, turns, z)
 
-    @property
-    def line(self) -> NonsynchronousLine | None:
-        """What was found last."""
-        return self._line
-
     def depart(self, onset: int) -> None:
         """The machine was healthy before a revolution, and is not any more."""
+        if self._since is not None and onset - self._since < REVOLUTIONS:
+            return  # a beat seems to end and to begin again
         self._before = self._positions.stretch(onset - REVOLUTIONS, onset)
-        self._since, self._line = onset, None
-        self._next = onset + _SETTLING + _EVERY
+        self._since, self._found = onset, None
+        self._next = onset + _SETTLING + EVERY
 
-    def evaluate(self, revolution: int, healthy: Calibration) -> NonsynchronousLine | None:
+    def evaluate(self, revolution: int, healthy: Calibration) -> Found | None:
         """The line that came with the change, by all revolutions up to now, or nearly all.
 
         Args:
@@ -457,9 +494,9 @@ class NonsynchronousSearch:
             healthy: the machine before.
         """
         if self._since is None or revolution < self._next:
-            return self._line
+            return self._found
         begin = max(self._since + _SETTLING, revolution - REVOLUTIONS)
         now = self._positions.stretch(begin, revolution + 1)
-        self._line = None if now is None else new_line(now, self._before, healthy, self._speed_uncertainty)
-        self._next = revolution + _EVERY
-        return self._line
+        self._found = None if now is None else new_line(now, self._before, healthy, self._speed_uncertainty)
+        self._next = revolution + EVERY
+        return self._found

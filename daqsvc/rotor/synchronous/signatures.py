@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -433,6 +433,8 @@ def anything(change: Complexes, variance: Floats, healthy: Healthy) -> float:
 
 _GENERIC_RUB_MARGIN_NATS = 12.0
 _ENERGY_NATS = 12.0
+_ALL_OF_IT = 0.9
+"""Part of the energy of a line that is taken for all of it."""
 _MOST_ENERGY_NATS = 100.0
 _MISFIT = 0.005
 """Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
@@ -502,6 +504,7 @@ class Identification:
         excess: variance of a complex sample that does not repeat with the shaft, above the healthy one, um^2.
         candidates: verdict and group of this evaluation alone.
         line: that came with the change beside the harmonics of the shaft; None if none stands out.
+        by_line: whether this line is what has changed.
     """
 
     verdict: RotorFault
@@ -514,6 +517,19 @@ class Identification:
     candidates: tuple[RotorFault, ...] = field(default=())
     excess: float = 0.0
     line: NonsynchronousLine | None = None
+    by_line: bool = False
+
+
+class WithoutLine(NamedTuple):
+    """The change of the harmonics without a line that beats with one of them.
+
+    Attributes:
+        change: complex128 ``[5]``, um.
+        variance: float64 ``[5]``, um^2.
+    """
+
+    change: Complexes
+    variance: Floats
 
 
 def identify(
@@ -527,6 +543,7 @@ def identify(
     comparison: Comparison | None = None,
     energy: Energy | None = None,
     line: NonsynchronousLine | None = None,
+    rest: WithoutLine | None = None,
 ) -> Identification:
     """Weigh the hypotheses.
 
@@ -541,11 +558,15 @@ def identify(
         comparison: what the transient shows of unbalance and loss of damping, if it was abrupt.
         energy: of the present segment; motion that does not repeat with the shaft (whirl, repeated
             impacts) is what no linear fault makes.
-        line: that came with the change beside the harmonics. Where the mains are what has changed, it is no
-            fault of the rotor, whatever the vector of a part of their beat looks like.
+        line: that came with the change beside the harmonics.
+        rest: what the change is without it, where it beats with a harmonic. Where nothing is left, the line
+            is what has changed, and no fault of the rotor.
     """
     amplitude = healthy.healthy.amplitude_um
     least = (rules.least_severity * amplitude) ** 2
+    energy = _without(energy, line)
+    if rest is not None and line is not None and (line.modulates is None or _is_still(rest, healthy)):
+        change, variance = rest
     shaken = energy is not None and energy.nats > _ENERGY_NATS and energy.excess > least
     position = healthy.baseline + change[: len(healthy.baseline)]
     scores = likelihoods(change, variance, healthy.healthy, position, shaken=shaken)
@@ -563,27 +584,31 @@ def identify(
         explained = {"unmodelled"} if scores["rub"] < rules.margin_nats else {"unmodelled", "rub"}
         for name in scores.keys() - explained:
             scores[name] -= unexplained
-    excess = energy.excess if energy is not None and energy.nats > _ENERGY_NATS else 0.0
-    by_mains = False
-    if line is not None and line.is_the_change:
-        by_mains = True
-        excess = max(excess, line.amplitude_um**2)
-        square = max(square, line.amplitude_um**2)
-        for name in scores.keys() - {"unmodelled"}:
-            scores[name] = min(scores[name], scores["unmodelled"] - _MOST_ENERGY_NATS)
     size = math.sqrt(square)
     # The typical component: that of the mean position may be drift of the probes, or not there at all.
     deviation = math.sqrt(float(np.median(variance)))
     best = max(scores, key=lambda name: scores[name])
+    excess = energy.excess if energy is not None and energy.nats > _ENERGY_NATS else 0.0
+    is_small = size < rules.least_severity * amplitude + 2.0 * deviation
+    by_line = line is not None and line.is_foreign and (best == "normal" or is_small)
+    if line is not None:
+        excess = max(excess, line.amplitude_um**2)
+    if line is not None and by_line:
+        scores = {name: min(nats, scores["unmodelled"] - _MOST_ENERGY_NATS) for name, nats in scores.items()}
+        scores["unmodelled"] += _MOST_ENERGY_NATS
+        best, size = "unmodelled", max(size, line.amplitude_um)
+        is_small = size < rules.least_severity * amplitude + 2.0 * deviation
     probabilities = posterior(scores)
     candidates: tuple[RotorFault, ...]
-    if best != "normal" and size < rules.least_severity * amplitude + 2.0 * deviation:
+    if best != "normal" and is_small:
         candidates = ("small_change",)
         probabilities = {"normal": probabilities["normal"], "small_change": 1.0 - probabilities["normal"]}
+    elif by_line:
+        candidates = ("unmodelled",)
     else:
         marked = shaken or has_marks(change, variance)
         candidates = _group(scores, best, healthy, rules, marked=marked)
-    agreed = by_mains or (
+    agreed = by_line or (
         previous is not None
         and (
             set(previous.candidates) == set(candidates)
@@ -608,7 +633,23 @@ def identify(
         candidates=candidates,
         excess=excess,
         line=line,
+        by_line=by_line,
     )
+
+
+def _without(energy: Energy | None, line: NonsynchronousLine | None) -> Energy | None:
+    """The energy that no line makes which is none of the rotor's."""
+    if energy is None or energy.excess <= 0.0 or line is None or not line.is_foreign:
+        return energy
+    left = 1.0 - line.share if line.share < _ALL_OF_IT else 0.0
+    return Energy(energy.excess * left, energy.nats * left**2)
+
+
+def _is_still(rest: WithoutLine, healthy: Calibration) -> bool:
+    """Whether nothing has changed beside a line."""
+    position = healthy.baseline + rest.change
+    scores = likelihoods(rest.change, rest.variance, healthy.healthy, position)
+    return max(scores.values()) <= scores["normal"]
 
 
 def _group(

@@ -18,6 +18,7 @@ import numpy as np
 from daqsvc.rotor.synchronous.baseline import (
     Calibration,
     NotCalibratableError,
+    at_speed,
     calibrate,
     compensated,
     deviation_of,
@@ -40,8 +41,8 @@ from daqsvc.rotor.synchronous.judged import (
     thrice_of,
 )
 from daqsvc.rotor.synchronous.lessons import Lessons
-from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousSearch
-from daqsvc.rotor.synchronous.signatures import Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.nonsynchronous import EVERY, Found, NonsynchronousSearch
+from daqsvc.rotor.synchronous.signatures import Identification, NamingRules, WithoutLine, identify
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
@@ -74,6 +75,8 @@ _KEPT = 512
 """Revolutions that identification can reach back."""
 _PLACED_WITHIN = 0.5
 """Samples within which a keyphasor's edge lies while no others place it."""
+_LEFT_OF_LINE = 0.05
+"""Part of a line that may stay in a harmonic that it beats with: no grid is quite steady."""
 _ABRUPT = 4
 """Revolutions in the window of a departure up to which its transient is examined."""
 
@@ -357,7 +360,12 @@ class RotorWatch:
         if self._onset is None:
             return True
         since = row.revolution - self._reference_from
-        if since < _SETTLING or self._by_mains:
+        if self._beats:
+            # What follows is compared with what comes after it; until then the rest is named without it.
+            self._reference_from = row.revolution
+            self._segment.clear()
+            return False
+        if since < _SETTLING:
             return False
         if since < _SETTLING + _LEAST_SEGMENT:
             self._segment.append(row)
@@ -369,10 +377,12 @@ class RotorWatch:
         return True
 
     @property
-    def _by_mains(self) -> bool:
-        """Whether the mains are what has changed: they beat with the harmonics without end."""
-        line = self._lines.line
-        return line is not None and line.is_the_change
+    def _beats(self) -> bool:
+        """Whether a line beats with a harmonic without end, so that no two segments are alike."""
+        now = self._identification
+        if self._onset is None or now is None or now.line is None or not now.line.beats:
+            return False
+        return now.by_line or now.line.modulates is None
 
     def _depart(self, onset: int, window: int) -> None:
         assert self._test is not None  # noqa: S101
@@ -395,7 +405,7 @@ class RotorWatch:
     def _maybe_look(self, revolution: int) -> bool:
         assert self._onset is not None  # noqa: S101
         since = revolution - self._onset + 1
-        if since < self._next_look():
+        if since < self._next_look() and not (self._beats and since % EVERY == 0):
             return False
         while self._next_look() <= since:
             self._look += 1
@@ -450,6 +460,7 @@ class RotorWatch:
         if now is not None and self._thrice is not None:
             change = np.append(change, now.mean - self._thrice.mean)
             variance = np.append(variance, now.apart_from(self._thrice, self._healthy.amplitude_um))
+        found = self._lines.evaluate(revolution, self._healthy)
         self._identification = identify(
             change,
             variance,
@@ -459,8 +470,26 @@ class RotorWatch:
             may_name=may_name,
             comparison=self._comparison,
             energy=lasting_energy(rows, self._healthy) if since >= _NAMED_FROM else None,
-            line=self._lines.evaluate(revolution, self._healthy),
+            line=None if found is None else found.line,
+            rest=None if found is None else self._without_line(found),
         )
+
+    def _without_line(self, found: Found) -> WithoutLine | None:
+        """The change of the harmonics without a line that beats with one of them."""
+        assert self._healthy is not None  # noqa: S101
+        healthy = self._healthy
+        if not found.line.beats:
+            return None
+        spread = self._spread(healthy)
+        rows = list(self._rows)[-found.revolutions :]
+        terms = np.mean([row.terms for row in rows], axis=0)
+        change = np.zeros(5, dtype=np.complex128)
+        if found.harmonics is not None:
+            change = at_speed(found.harmonics, terms, healthy) - healthy.baseline
+        if self._reference is not None:
+            terms = terms - self._reference.terms
+        variance = spread.of_means(float(len(rows)), float(healthy.revolutions), terms)
+        return WithoutLine(change, variance + (_LEFT_OF_LINE * found.line.amplitude_um) ** 2)
 
     def _return_to_health(self) -> None:
         assert self._healthy is not None  # noqa: S101

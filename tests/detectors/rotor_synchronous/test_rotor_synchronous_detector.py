@@ -477,7 +477,8 @@ def test_the_listener_hears_every_judged_revolution(steady):
     assert np.diff([report.end_index for report, _ in heard]) == pytest.approx(PER_REV, abs=1)
 
 
-def test_the_mains_are_stated_with_their_frequency_and_no_fault_is_named(steady):
+def test_the_mains_are_stated_with_their_frequency_and_no_fault_is_named():
+    steady = channels(revolutions=150.0, seed=1)
     t = np.arange(len(steady)) / RATE_HZ
     hum = 6.0 * np.cos(2.0 * math.pi * 60.0 * t) * (t > 2.2)
     samples = steady + np.column_stack((hum, 0.3 * hum, np.zeros_like(hum))).astype(np.float32)
