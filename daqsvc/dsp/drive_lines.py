@@ -275,16 +275,10 @@ def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines 
         known: how well, as a share: a line as near to an order may be the shaft's.
     """
     for line_hz in _LINE_FREQUENCIES_HZ:
-        twice_hz, reach_hz = 2.0 * line_hz, 2.0 * line_hz * _GRID_SHARE
-        if lines.level_db(twice_hz, reach_hz) < _LINE_DB:
+        peak_hz = _line_of_grid(lines, 2.0 * line_hz, shaft_hz, known, parts=(1,))
+        if peak_hz is None:
             continue
-        peak_hz = lines.strongest_hz(twice_hz, reach_hz)
-        if lines.narrow_db(peak_hz, skirt_share=0.5) < _LINE_DB:
-            continue  # smeared, as slip smears a bearing's
         order = peak_hz / shaft_hz
-        beside_hz = abs(order - round(order)) * shaft_hz
-        if abs(peak_hz - twice_hz) > reach_hz or beside_hz < max(2.0 * lines.step_hz, known * peak_hz):
-            continue  # a harmonic of the shaft, or of something else
         for pairs in range(1, _MOST_POLE_PAIRS + 1):
             synchronous_hz = 0.5 * peak_hz / pairs
             slip_hz = synchronous_hz - shaft_hz
@@ -298,3 +292,42 @@ def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines 
             return DriveLines("motor", peak_hz, order, spacing=spacing if shows else None, poles=2 * pairs)
         return DriveLines("motor", peak_hz, order)
     return None
+
+
+def mains_line(lines: LineLevels, shaft_hz: float, known: float) -> float | None:
+    """Frequency of the mains, if they stand out: cables pick them up; None if they do not.
+
+    Args:
+        lines: of a signal's spectrum.
+        shaft_hz: revolutions per second.
+        known: how well, as a share: a line as near to an order, a half or a third of one may be the shaft's.
+    """
+    found = (_line_of_grid(lines, hz, shaft_hz, known, parts=(1, 2, 3)) for hz in _LINE_FREQUENCIES_HZ)
+    return next((hz for hz in found if hz is not None), None)
+
+
+def _line_of_grid(
+    lines: LineLevels, grid_hz: float, shaft_hz: float, known: float, parts: tuple[int, ...]
+) -> float | None:
+    """Where a narrow line at a frequency of the grid is; None if there is none, or it may be the shaft's.
+
+    Args:
+        lines: of a signal's spectrum.
+        grid_hz: where it is looked for.
+        shaft_hz: revolutions per second.
+        known: how well, as a share.
+        parts: of the shaft's speed that have harmonics where the line may be one.
+    """
+    reach_hz = grid_hz * _GRID_SHARE
+    if lines.level_db(grid_hz, reach_hz) < _LINE_DB:
+        return None
+    peak_hz = lines.strongest_hz(grid_hz, reach_hz)
+    if lines.narrow_db(peak_hz, skirt_share=0.5) < _LINE_DB:
+        return None  # smeared, as slip smears a bearing's
+    orders = (peak_hz / shaft_hz * part for part in parts)
+    beside_hz = min(
+        abs(order - round(order)) / part * shaft_hz for order, part in zip(orders, parts, strict=True)
+    )
+    if abs(peak_hz - grid_hz) > reach_hz or beside_hz < max(2.0 * lines.step_hz, known * peak_hz):
+        return None  # a harmonic of the shaft, or of something else
+    return peak_hz

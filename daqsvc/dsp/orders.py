@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import scipy.fft
 
-from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines
+from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines, mains_line
 from daqsvc.dsp.speed.lines import ORDERS, find_speed
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ class OrderVectors:
         nominal_rpm: the speed that was stated.
         revolutions_per_block: shaft revolutions in a block.
         drives: gears and induction motors whose lines stand out.
+        mains_hz: of the mains, if they stand out; None if not.
         motor_hz: of a motor's line so near to an order that it was taken out of it; None if there is none.
     """
 
@@ -73,6 +74,7 @@ class OrderVectors:
     nominal_rpm: float
     revolutions_per_block: int
     drives: tuple[DriveLines, ...] = ()
+    mains_hz: float | None = None
     motor_hz: float | None = None
 
     def __len__(self) -> int:
@@ -121,7 +123,7 @@ def order_vectors(
     present: Flags = np.asarray(there.all(axis=1))
     centred = np.where(present[:, np.newaxis], values - np.nanmean(values, axis=0), 0.0)
     speed = find_speed(centred, rate_hz, nominal_hz)
-    drives = _drives(centred, rate_hz, speed)
+    drives, mains_hz = _drives(centred, rate_hz, speed)
     motor_hz = _beside_order(drives, len(centred) / rate_hz, speed.hz)
     if motor_hz is not None:
         _take_out(motor_hz, centred, present, rate_hz, speed.hz)
@@ -140,21 +142,24 @@ def order_vectors(
         nominal_rpm=abs(speed_rpm),
         revolutions_per_block=revolutions,
         drives=drives,
+        mains_hz=mains_hz,
         motor_hz=motor_hz,
     )
 
 
-def _drives(centred: Floats, rate_hz: float, speed: LineSpeed) -> tuple[DriveLines, ...]:
-    """Gears and motors whose lines stand out, one of each kind at most."""
+def _drives(centred: Floats, rate_hz: float, speed: LineSpeed) -> tuple[tuple[DriveLines, ...], float | None]:
+    """Gears and motors whose lines stand out, one of each kind at most, and the frequency of the mains."""
     known = speed.deviation_hz / speed.hz * _DEVIATIONS
     found: dict[str, DriveLines] = {}
+    mains_hz: float | None = None
     for channel in range(centred.shape[1]):
         spectrum = scipy.fft.rfft(centred[:, channel])
         top_hz = max(TOP_ORDER * speed.hz, ORDERS[-1] * speed.hz + _MOTOR_TOP_HZ)
         levels = LineLevels(spectrum, rate_hz / len(centred), top_hz)
         for drive in drive_lines(levels, speed.hz, known=known):
             found.setdefault(drive.kind, drive)
-    return tuple(found.values())
+        mains_hz = mains_hz or mains_line(levels, speed.hz, known)
+    return tuple(found.values()), mains_hz
 
 
 def _beside_order(drives: Sequence[DriveLines], seconds: float, speed_hz: float) -> float | None:

@@ -379,7 +379,7 @@ def analyse_orders(
 
 
 def _of_drives(orders: OrderVectors) -> Iterator[str]:
-    """What lines of gears and motors do to the comparison."""
+    """What lines of gears, motors and the mains do to the comparison."""
     speed_hz = orders.speed_rpm / 60.0
     for drive in orders.drives:
         if drive.kind == "gear":
@@ -397,3 +397,8 @@ def _of_drives(orders: OrderVectors) -> Iterator[str]:
             )
         else:
             yield f"{line}: it counts as vibration beside the orders, and is no fault of the rotor"
+    if orders.mains_hz is not None:
+        yield (
+            f"a line stands out at {orders.mains_hz:.2f} Hz, the mains, as cables pick them up: it counts as "
+            "vibration beside the orders, and is no fault of the rotor"
+        )

@@ -191,6 +191,10 @@ OF_A_MOTOR = (
     "a line of an induction motor stands out at 100.00 Hz, twice the mains: it counts as vibration beside "
     "the orders, and is no fault of the rotor"
 )
+OF_CABLES = (
+    "a line stands out at 50.00 Hz, the mains, as cables pick them up: it counts as vibration beside the "
+    "orders, and is no fault of the rotor"
+)
 OF_A_GEAR = (
     "a gear of 23 teeth on this shaft meshes at 568.1 Hz with a mate of 60 teeth: its lines count as "
     "vibration beside the orders"
@@ -201,6 +205,7 @@ OF_A_GEAR = (
     ("lines", "note"),
     [
         ({100.0: 0.4}, OF_A_MOTOR),
+        ({50.0: 0.4}, OF_CABLES),
         (
             {23 * 24.7: 0.6, 46 * 24.7: 0.3}
             | {k * 23 * 24.7 + side * 24.7 * 23 / 60: 0.1 for k in (1, 2) for side in (-2, -1, 1, 2)},
@@ -225,6 +230,16 @@ def test_lines_of_a_drive_beside_the_orders_are_stated(
     document = json.loads(capsys.readouterr().out)
     assert document["data_quality"]["problems"] == [note]
     assert document["verdict"] in {"normal", "unmodelled"}
+
+
+def test_a_half_order_is_not_taken_for_the_mains() -> None:
+    rate_hz = 4000.0
+    t = np.arange(40_000) / rate_hz
+    samples = 0.3 * np.random.default_rng(3).standard_normal(len(t))
+    samples += sum(a * np.cos(2 * np.pi * k * 100.0 * t) for k, a in enumerate(HARMONICS, 1))
+    assert order_vectors(samples + np.cos(2 * np.pi * 50.0 * t), rate_hz, 6000.0).mains_hz is None
+    beside = order_vectors(samples + np.cos(2 * np.pi * 60.0 * t), rate_hz, 6000.0)
+    assert beside.mains_hz == pytest.approx(60.0, abs=0.02)
 
 
 def test_probabilities_sum_to_one() -> None:
