@@ -375,3 +375,18 @@ def test_a_recording_of_hum_is_told_as_hum(hum, capsys):
     # Without a mean position rub and unmodelled changes are one group, but this is none of them.
     assert main([*hum, "--ac-coupled", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["group"] == ["unmodelled"]
+
+
+@pytest.mark.parametrize("per_rev", [8, 10, 12, 16, 33])
+def test_few_samples_a_revolution_are_enough(per_rev):
+    """Twelve show the sixth harmonic and its opposite alike."""
+    count = HEALTHY_REVOLUTIONS + 400
+    cut = orbits(np.tile(HEALTHY, (count, 1)), 1.0, 3, per_rev=per_rev)
+    t = np.arange(count * per_rev) / (per_rev * TWO_POLE_HZ)
+    motion = np.where(t * TWO_POLE_HZ < HEALTHY_REVOLUTIONS, 0.0, flat_line(50.0, 6.0)(t))
+    cut = replace(cut, xy=cut.xy + np.column_stack((motion.real, motion.imag)))
+    watch = RotorWatch(replace(ROTOR, natural_frequency_hz=TWO_POLE_HZ), per_rev * TWO_POLE_HZ)
+    watch.evaluate(synchronous_vectors(cut), cut)
+    found = watch.finish()
+    assert found.group == ("unmodelled",)
+    assert (found.by_line, found.line.mains) == (True, 1)

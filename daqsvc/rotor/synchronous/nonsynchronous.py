@@ -76,6 +76,8 @@ _OIL_WHIRL = (0.35, 0.5)
 _MOST_OF_CLEARANCE = 0.5
 """No mains move a signal by more than this part of the clearance."""
 _GRID_STEPS = 9
+_RIDGE = 1e-9
+"""Keeps a fit from failing where two columns are alike."""
 _LEAST_OVER_NOISE = 30.0
 _ALL_OF_IT = 0.9
 """Part of all new motion that the mains must be where they are not resolved from a harmonic ..."""
@@ -219,14 +221,20 @@ class _Spectrum:
 
 
 def _harmonics(stretch: Stretch) -> Complexes:
-    """Harmonics of the shaft, complex128 ``[n, 2 H + 1]``, from the most backward one to the most forward."""
+    """Harmonics of the shaft, complex128 ``[n, 2 H + 1]``: `HARMONICS`, then all others that show."""
     turning = np.exp(2j * math.pi * stretch.turns)
-    return np.stack([turning**k for k in range(-_HIGHEST, _HIGHEST + 1)], axis=1)
+    points_per_rev = len(stretch.z) / max(stretch.revolutions, 1.0)
+    # With fewer points two of them are one.
+    highest = max(2, min(_HIGHEST, math.ceil(points_per_rev / 2.0) - 1))
+    others = [k for k in range(-highest, highest + 1) if k not in HARMONICS]
+    return np.stack([turning**k for k in (*HARMONICS, *others)], axis=1)
 
 
 def _fitted(basis: Complexes, z: Complexes) -> Complexes:
     """Least-squares coefficients of columns that are nearly orthogonal."""
-    return np.asarray(np.linalg.solve(basis.conj().T @ basis, basis.conj().T @ z))
+    normal = basis.conj().T @ basis
+    normal += _RIDGE * len(basis) * np.eye(len(normal))
+    return np.asarray(np.linalg.solve(normal, basis.conj().T @ z))
 
 
 def new_line(
@@ -300,9 +308,9 @@ def _described(
     going = [np.exp(2j * math.pi * sign * hz * seconds) for hz in frequencies for sign in (1.0, -1.0)]
     basis = np.column_stack((_harmonics(part), *going)) * part.there[:, np.newaxis]
     fit = _fitted(basis, part.z)
-    forward, backward = (float(abs(each)) for each in fit[2 * _HIGHEST + 1 :][:2])
-    harmonics = fit[[_HIGHEST + k for k in HARMONICS]]
-    amplitude_um = math.sqrt(float((np.abs(fit[2 * _HIGHEST + 1 :]) ** 2).sum()))
+    harmonics, sides = fit[: len(HARMONICS)], np.abs(fit[-len(going) :])
+    forward, backward = float(sides[0]), float(sides[1])
+    amplitude_um = math.sqrt(float((sides**2).sum()))
     left = (part.z - basis @ fit)[part.there]
     others = max(float((np.abs(left) ** 2).mean()) - healthy.noise / part.averaged, 0.0)
     share = amplitude_um**2 / (amplitude_um**2 + others)
@@ -447,8 +455,8 @@ def _mains_in_a_beat(
 
 def _off_orbit(stretch: Stretch, healthy: Calibration) -> Complexes:
     """Positions off the healthy orbit, complex128 ``[n]``, um; 0 where missing."""
-    columns = [_HIGHEST + k for k in HARMONICS]
-    return np.where(stretch.there, stretch.z - _harmonics(stretch)[:, columns] @ healthy.baseline, 0.0)
+    orbit = _harmonics(stretch)[:, : len(HARMONICS)] @ healthy.baseline
+    return np.where(stretch.there, stretch.z - orbit, 0.0)
 
 
 def _sides(stretch: Stretch, off: Complexes, hz: float) -> Complexes:
