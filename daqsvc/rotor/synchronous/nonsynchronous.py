@@ -59,6 +59,10 @@ _WINDOW_BINS = 1.5
 """Bins of noise that Hann's window lets through."""
 _APART_BINS = 2.5
 """Bins beside a harmonic where its own changes end up."""
+_HALF = 0.5
+"""Part of a line below which it has ended."""
+_KNOWN_BINS = 3.0
+"""The same, from which on it stays known."""
 _DEVIATIONS = 4.0
 _LINE_DB = 15.0
 """A line of the mains, of which it is known where it would be ..."""
@@ -250,7 +254,7 @@ def new_line(
     """
     if before is not None and before.revolutions < LEAST_REVOLUTIONS / 4:
         before = None
-    shaft_hz = now.revolutions * now.rate_hz / float(np.ptp(np.flatnonzero(now.there)))
+    shaft_hz = float(now.revolutions * now.rate_hz / np.ptp(np.flatnonzero(now.there)))
     found = None
     if now.revolutions >= LEAST_REVOLUTIONS:
         found = _standing_out(now, before, shaft_hz, healthy)
@@ -340,6 +344,8 @@ def _mains_in(line: NonsynchronousLine, revolutions: float, healthy: Calibration
         return 0
     if line.forward is None:
         return mains
+    if not _is_near(order) and line.amplitude_um > healthy.amplitude_um:
+        return 0  # a whirl by itself
     # Cables give all probes the same, so that the orbit is a line.
     return mains if mains != 1 and not _OIL_WHIRL[0] < order < _OIL_WHIRL[1] else 0
 
@@ -481,6 +487,9 @@ class NonsynchronousSearch:
         self._since: int | None = None
         self._next = 0
         self._found: Found | None = None
+        self._shown_rev = 0.0
+        self._is_partial = False
+        self._most_um = 0.0
 
     def add(self, revolution: int, first_index: int, turns: Floats, z: Complexes) -> None:
         """Keep a revolution; see `LastPositions.add`."""
@@ -503,8 +512,47 @@ class NonsynchronousSearch:
         """
         if self._since is None or revolution < self._next:
             return self._found
+        self._next = revolution + EVERY
         begin = max(self._since + _SETTLING, revolution - REVOLUTIONS)
         now = self._positions.stretch(begin, revolution + 1)
-        self._found = None if now is None else new_line(now, self._before, healthy, self._speed_uncertainty)
-        self._next = revolution + EVERY
-        return self._found
+        known = self._found is not None and not self._is_partial
+        if known and (now is None or now.revolutions < self._shown_rev):
+            return self._found  # after a gap there are too few
+        if known and now is not None:
+            now = now.last(self._shown_rev)
+        found = None if now is None else new_line(now, self._before, healthy, self._speed_uncertainty)
+        if known and now is not None and self._found is not None and not _is_same(found, self._found):
+            found = _fitted_again(now, self._found.line, healthy)
+        if known and found is not None and found.line.amplitude_um < _HALF * self._most_um:
+            found = None
+        if found is None and self._found is not None:
+            self._since = revolution - EVERY
+        elif found is not None and now is not None and not known:
+            self._is_partial = found.line.beats and found.harmonics is None
+            self._shown_rev = min(_shown_by(now, found.line), REVOLUTIONS - 2.0 * EVERY)
+        self._found = found
+        self._most_um = 0.0 if found is None else max(self._most_um, found.line.amplitude_um)
+        return found
+
+
+def _shown_by(now: Stretch, line: NonsynchronousLine) -> float:
+    """Revolutions that show whether a line is still there."""
+    least = max(now.revolutions, 2.0 * LEAST_REVOLUTIONS)
+    apart = abs(line.order - round(line.order))
+    return max(least, _KNOWN_BINS / apart) if line.beats else least
+
+
+def _is_same(found: Found | None, before: Found) -> bool:
+    """Whether a line that was found is what was found before."""
+    if found is None:
+        return False
+    now, then = found.line, before.line
+    alike = (now.mains, now.modulates) == (then.mains, then.modulates)
+    return alike and abs(now.order - then.order) < _NEAR
+
+
+def _fitted_again(now: Stretch, line: NonsynchronousLine, healthy: Calibration) -> Found:
+    """A line that was known, as a fault beside it may hide it in the spectrum."""
+    shaft_hz = line.frequency_hz / line.order
+    fitted = _described(now, line.frequency_hz, shaft_hz, healthy, line.modulates)
+    return fitted._replace(line=replace(fitted.line, mains=line.mains, poles=line.poles))

@@ -18,6 +18,8 @@ REVOLUTIONS = 512
 """Revolutions that are kept: a line 1 % beside a harmonic is five bins away from it then."""
 _POINTS_PER_REV = 32
 _MOST_MISSING = 0.3
+_LONG_GAP = 0.5
+"""Revolutions that may be lost without being counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,8 @@ class LastPositions:
         """
         if not self._averaged:
             self._averaged = max(1, len(z) // _POINTS_PER_REV)
+        if first_index < self._next:
+            self._kept.clear()  # the stream has begun again
         if first_index != self._next:
             self._rest_z, self._rest_turns = self._rest_z[:0], self._rest_turns[:0]
         self._next = first_index + len(z)
@@ -109,8 +113,8 @@ class LastPositions:
         self._kept.append(_Kept(revolution, first, means.astype(np.complex64), at))
 
     def stretch(self, begin: int, end: int) -> Stretch | None:
-        """The revolutions from one up to before another; None if too much is missing."""
-        kept = [one for one in self._kept if begin <= one.revolution < end]
+        """The revolutions from one up to before another, after a long gap; None if too much is missing."""
+        kept = _after_gaps([one for one in self._kept if begin <= one.revolution < end])
         if not kept:
             return None
         first = kept[0].first
@@ -124,3 +128,12 @@ class LastPositions:
             return None
         z[~there] = 0.0
         return Stretch(z, turns, there, self._rate_hz / self._averaged, self._averaged)
+
+
+def _after_gaps(kept: list[_Kept]) -> list[_Kept]:
+    """The last of them that have no gap of a revolution between them: how far the shaft turned is known."""
+    for i in range(len(kept) - 1, 0, -1):
+        ends = kept[i - 1].first + len(kept[i - 1].z)
+        if kept[i].first - ends > _LONG_GAP * len(kept[i].z):
+            return kept[i:]
+    return kept

@@ -565,7 +565,7 @@ def identify(
     amplitude = healthy.healthy.amplitude_um
     least = (rules.least_severity * amplitude) ** 2
     energy = _without(energy, line)
-    if rest is not None and line is not None and (line.modulates is None or _is_still(rest, healthy)):
+    if rest is not None and line is not None and (line.modulates is None or _is_still(rest, healthy, rules)):
         change, variance = rest
     shaken = energy is not None and energy.nats > _ENERGY_NATS and energy.excess > least
     position = healthy.baseline + change[: len(healthy.baseline)]
@@ -645,11 +645,12 @@ def _without(energy: Energy | None, line: NonsynchronousLine | None) -> Energy |
     return Energy(energy.excess * left, energy.nats * left**2)
 
 
-def _is_still(rest: WithoutLine, healthy: Calibration) -> bool:
-    """Whether nothing has changed beside a line."""
-    position = healthy.baseline + rest.change
-    scores = likelihoods(rest.change, rest.variance, healthy.healthy, position)
-    return max(scores.values()) <= scores["normal"]
+def _is_still(rest: WithoutLine, healthy: Calibration, rules: NamingRules) -> bool:
+    """Whether nothing that would get a name has changed beside a line."""
+    scores = likelihoods(rest.change, rest.variance, healthy.healthy, healthy.baseline + rest.change)
+    least = rules.least_severity * healthy.healthy.amplitude_um
+    small = float(np.linalg.norm(rest.change)) < least + 2.0 * math.sqrt(float(np.median(rest.variance)))
+    return small or max(scores.values()) <= scores["normal"]
 
 
 def _group(

@@ -75,6 +75,8 @@ _KEPT = 512
 """Revolutions that identification can reach back."""
 _PLACED_WITHIN = 0.5
 """Samples within which a keyphasor's edge lies while no others place it."""
+_ENDED = 3
+"""Revolutions that are judged first after a line has ended."""
 _LEFT_OF_LINE = 0.05
 """Part of a line that may stay in a harmonic that it beats with: no grid is quite steady."""
 _ABRUPT = 4
@@ -175,6 +177,7 @@ class RotorWatch:
         self._alarm: tuple[int, int] | None = None
         self._comparison: Comparison | None = None
         self._thrice: Thrice | None = None
+        self._was_line: bool | None = None
         self._lines = NonsynchronousSearch(rate_hz, self.rules.speed_uncertainty)
         if calibration is not None:
             self._begin(calibration)
@@ -265,12 +268,14 @@ class RotorWatch:
             self._alarm = (row.revolution, evidence.window) if abrupt else None
             self._comparison = None
         elif self._onset is not None:
+            before = self._identification
             if self._alarm is not None and row.revolution == self._alarm[0] + REVOLUTIONS:
                 self._comparison = self._orbits.compare(self._onset, self._healthy or self.calibration)
                 if self._comparison is not None:
                     self._identify(row.revolution, may_name=True)
                     looked = True
             looked = self._maybe_look(row.revolution) or looked
+            departed = self._turns(before, row.revolution)
         elif settled and rate_known:
             self._learn(row)
         return self._report(one, evidence, departed=departed, looked=looked)
@@ -384,6 +389,30 @@ class RotorWatch:
             return False
         return now.by_line or now.line.modulates is None
 
+    def _turns(self, before: Identification | None, revolution: int) -> bool:
+        """Begin a new segment where a line has ended, or a fault has begun or ended beside one.
+
+        Args:
+            before: the evaluation before.
+            revolution: the present one.
+
+        Returns:
+            Whether it is another change, and not only the end of one.
+        """
+        now = self._identification
+        if self._onset is None or before is None or now is None or before is now or before.line is None:
+            return False
+        ended = now.line is None
+        if not ended:
+            agreed = now.named and set(now.group) == set(now.candidates)
+            was, self._was_line = self._was_line, now.by_line if agreed else self._was_line
+            if was is None or was == self._was_line:
+                return False
+        self._onset = revolution - (_ENDED if ended else EVERY)
+        self._reference_from, self._look = revolution, 0
+        self._segment.clear()
+        return not ended
+
     def _depart(self, onset: int, window: int) -> None:
         assert self._test is not None  # noqa: S101
         assert self.calibration is not None  # noqa: S101
@@ -396,7 +425,7 @@ class RotorWatch:
             self._middle = self._begun + before.revolutions / 2.0
             self._thrice = thrice_of([row for row in self._rows if row.revolution < onset])
             self._lines.depart(onset)
-        self._onset = onset
+        self._onset, self._was_line = onset, None
         # A slow change is seen long after its onset: what came before belongs to the reference of before.
         self._reference_from = max(onset, onset + window - 1 - _SETTLING)
         self._look = 0
