@@ -112,7 +112,7 @@ class LineJson(TypedDict):
         frequency_hz: where it is.
         order: the same per revolution of the shaft.
         amplitude_um: root mean square radius of its motion.
-        forward: whether the shaft goes around with its rotation or against it; null if it goes to and fro.
+        forward: whether the shaft goes around with its rotation or against it; null: back and forth.
         mains: 1 if cables pick up the mains, 2 if it is twice the mains; 0 otherwise.
         modulates: harmonic that has such a line on either side; null if it is alone.
         poles: of the induction motor whose poles pass as often as the harmonic is modulated; null if unknown.

@@ -100,7 +100,7 @@ class NonsynchronousLine:
         frequency_hz: where it is.
         order: the same per revolution of the shaft.
         amplitude_um: square root of the mean square radius of its motion; of a round orbit the radius.
-        forward: whether the shaft goes around with its rotation or against it; None if it goes to and fro.
+        forward: whether the shaft goes around with its rotation or against it; None: back and forth.
         mains: 1 if cables pick up the mains, 2 if it is twice the mains; 0 otherwise.
         modulates: harmonic that has such a line on either side; None if it is alone.
         poles: of the induction motor whose poles pass as often as the harmonic is modulated; None if unknown.
@@ -137,7 +137,7 @@ class NonsynchronousLine:
         elif self.mains:
             what = "these are the mains, as cables pick them up"
         else:
-            sense = {True: "forward", False: "backward", None: "to and fro"}[self.forward]
+            sense = {True: "forward", False: "backward", None: "back and forth"}[self.forward]
             what = f"it goes {sense}, at no harmonic of the shaft"
             if any(_is_mains(self.frequency_hz, hz) for hz, _ in _mains()):
                 what += "; the mains have this frequency, too"
@@ -328,7 +328,7 @@ def _described(
 
 
 def _sense(forward: float, backward: float) -> bool | None:
-    """Whether a motion is forward; None where it goes to and fro."""
+    """Whether a motion is forward; None where it goes back and forth."""
     return None if min(forward, backward) > _FLAT * max(forward, backward) else forward > backward
 
 
