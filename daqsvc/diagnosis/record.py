@@ -42,7 +42,7 @@ class Diagnosis:
             ``"not_ok"`` if a sensor is outside its OK limits, dead or clipped. Unless it is good,
             ``decision`` is held from before: missing data never clears anything. Only where ``bounds`` show
             that it must be worse whatever is missing it may rise.
-        reason: why the quality is not good, in words for a person.
+        reason: why the quality is not good, in words for a person; if it is, what to know of the decision.
         sensors: names of the sensors that the statement rests on.
         model: name and version of the model behind the decision.
         missing_share: share of the window's samples that are missing; None if the detector does not state it.

@@ -17,13 +17,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     Complex = NDArray[np.complex128]
     Real = NDArray[np.float64]
 
-_LINE_FREQUENCIES_HZ = (50.0, 60.0)
-_GRID_SHARE = 0.002
+LINE_FREQUENCIES_HZ = (50.0, 60.0)
+GRID_SHARE = 0.002
 """How far a grid's frequency may be off."""
 _LINE_DB = 15.0
 """A line that stands out: of noise the best of 10,000 bins reaches 12 dB over its median."""
@@ -274,16 +276,12 @@ def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines 
         shaft_hz: revolutions per second.
         known: how well, as a share: a line as near to an order may be the shaft's.
     """
-    for line_hz in _LINE_FREQUENCIES_HZ:
+    for line_hz in LINE_FREQUENCIES_HZ:
         peak_hz = _line_of_grid(lines, 2.0 * line_hz, shaft_hz, known, parts=(1,))
         if peak_hz is None:
             continue
         order = peak_hz / shaft_hz
-        for pairs in range(1, _MOST_POLE_PAIRS + 1):
-            synchronous_hz = 0.5 * peak_hz / pairs
-            slip_hz = synchronous_hz - shaft_hz
-            if not 0.0 < slip_hz < _MOST_SLIP * synchronous_hz:
-                continue
+        for pairs, slip_hz in slips(0.5 * peak_hz, shaft_hz):
             spacing = 2.0 * pairs * slip_hz / shaft_hz
             shows = spacing * shaft_hz > 3.0 * lines.step_hz and any(
                 min(lines.level_db(carrier_hz + side * spacing * shaft_hz) for side in (-1, 1)) > _SIDEBAND_DB
@@ -294,6 +292,19 @@ def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines 
     return None
 
 
+def slips(line_hz: float, shaft_hz: float) -> Iterator[tuple[int, float]]:
+    """Pole pairs of the induction motors that a shaft may be of, with their slip in revolutions per second.
+
+    Args:
+        line_hz: frequency of the mains.
+        shaft_hz: revolutions per second.
+    """
+    for pairs in range(1, _MOST_POLE_PAIRS + 1):
+        synchronous_hz = line_hz / pairs
+        if 0.0 < synchronous_hz - shaft_hz < _MOST_SLIP * synchronous_hz:
+            yield pairs, synchronous_hz - shaft_hz
+
+
 def mains_line(lines: LineLevels, shaft_hz: float, known: float) -> float | None:
     """Frequency of the mains, if they stand out: cables pick them up; None if they do not.
 
@@ -302,7 +313,7 @@ def mains_line(lines: LineLevels, shaft_hz: float, known: float) -> float | None
         shaft_hz: revolutions per second.
         known: how well, as a share: a line as near to an order, a half or a third of one may be the shaft's.
     """
-    found = (_line_of_grid(lines, hz, shaft_hz, known, parts=(1, 2, 3)) for hz in _LINE_FREQUENCIES_HZ)
+    found = (_line_of_grid(lines, hz, shaft_hz, known, parts=(1, 2, 3)) for hz in LINE_FREQUENCIES_HZ)
     return next((hz for hz in found if hz is not None), None)
 
 
@@ -318,7 +329,7 @@ def _line_of_grid(
         known: how well, as a share.
         parts: of the shaft's speed that have harmonics where the line may be one.
     """
-    reach_hz = grid_hz * _GRID_SHARE
+    reach_hz = grid_hz * GRID_SHARE
     if lines.level_db(grid_hz, reach_hz) < _LINE_DB:
         return None
     peak_hz = lines.strongest_hz(grid_hz, reach_hz)

@@ -97,7 +97,7 @@ class _Statement(JsonPayload):
     quality: Quality = Field(
         description="whether the samples and sensors are good, samples are missing, or a sensor is not OK"
     )
-    reason: str = Field(description="why the quality is not good")
+    reason: str = Field(description="why the quality is not good; if it is, what to know of the decision")
     sensors: tuple[str, ...] = Field(description="names of the sensors that the statement rests on")
     model: str = Field(description="name and version of the model that it rests on")
     where: str = Field("", description="the part of the machine that it is about, e.g. a bearing; or empty")

@@ -77,7 +77,7 @@ class StatementPayload(JsonPayload):
     decision: str = Field(description="what the detector has decided")
     severity: Severity = Field(description="how bad that is")
     quality: Quality = Field(description="whether the samples and sensors are good")
-    reason: str = Field(description="why the quality is not good")
+    reason: str = Field(description="why the quality is not good; if it is, what to know of the decision")
     code: str | None = Field(None, description="code of that reason; null if there is none")
     age_s: Number = Field(description="age of the last sample that it rests on")
     measures: dict[str, MeasurePayload] = Field(description="of the last statement that had any")

@@ -361,9 +361,11 @@ class RotorSynchronousDetector:
             return doubts[-1]
         if self.refused:
             return RevolutionQuality("not_ok", f"cannot be calibrated: {self.refused}")
-        if self.ac_coupled:
-            return RevolutionQuality("good", "the probes show no mean position: a static load cannot be seen")
-        return RevolutionQuality()
+        notes = ["the probes show no mean position: a static load cannot be seen"] if self.ac_coupled else []
+        identification = None if self._report is None else self._report.identification
+        if identification is not None and identification.by_line:
+            notes.append(identification.describe_line())
+        return RevolutionQuality("good", "; ".join(notes))
 
     def _standing(self) -> Standing:
         watch, report = self._watch, self._report

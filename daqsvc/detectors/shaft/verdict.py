@@ -393,10 +393,8 @@ class RotorVerdict(Verdict):
             lines += [alarm.describe() for alarm in self.alarms]
         if self.identification is not None and self.calibration is not None:
             lines.append(self._change())
-            if (line := self.identification.line) is not None:
-                lines.append(
-                    line.describe() + ("; no fault of the rotor" if self.identification.by_line else "")
-                )
+            if sentence := self.identification.describe_line():
+                lines.append(sentence)
             lines += [
                 f"{words(fault)}: {', '.join(_figure(key, value) for key, value in level.items())}"
                 for fault, level in self.level.items()

@@ -221,15 +221,8 @@ def compensated(
     Returns:
         complex128 ``[R, 5]``, and float64 ``[R, 3]``: `speed_terms`.
     """
-    deviation = deviation_of(vectors, speed_rad_s, rate_hz)
-    slope, _ = rotor.speed_slope(speed_rad_s)
-    moved = vectors.vectors.copy()
-    moved[:, 1] /= 1.0 + slope * deviation
-    moved[:, 2] /= 1.0 + slope.conjugate() * deviation
-    terms = speed_terms(deviation, before)
-    if law is not None:
-        moved -= law.predicted_um(terms)
-    return moved, terms
+    terms = speed_terms(deviation_of(vectors, speed_rad_s, rate_hz), before)
+    return _at_one_speed(vectors.vectors, terms, rotor, speed_rad_s, law), terms
 
 
 def at_speed(vector: Complexes, terms: Floats, healthy: Calibration) -> Complexes:
@@ -240,11 +233,18 @@ def at_speed(vector: Complexes, terms: Floats, healthy: Calibration) -> Complexe
         terms: float64 ``[3]``, its `speed_terms`.
         healthy: the machine.
     """
-    slope, _ = healthy.rotor.speed_slope(healthy.speed_rad_s)
-    moved = vector.copy()
-    moved[FORWARD] /= 1.0 + slope * terms[0]
-    moved[BACKWARD] /= 1.0 + slope.conjugate() * terms[0]
-    return moved if healthy.law is None else np.asarray(moved - healthy.law.predicted_um(terms))
+    return _at_one_speed(vector, terms, healthy.rotor, healthy.speed_rad_s, healthy.law)
+
+
+def _at_one_speed(
+    vectors: Complexes, terms: Floats, rotor: LavalRotor, speed_rad_s: float, law: SpeedLaw | None
+) -> Complexes:
+    """Vectors ``[..., 5]`` with what the rotor and the law predict of their `speed_terms` taken out."""
+    slope, _ = rotor.speed_slope(speed_rad_s)
+    moved = vectors.copy()
+    moved[..., FORWARD] /= 1.0 + slope * terms[..., 0]
+    moved[..., BACKWARD] /= 1.0 + slope.conjugate() * terms[..., 0]
+    return moved if law is None else np.asarray(moved - law.predicted_um(terms))
 
 
 def calibrate(

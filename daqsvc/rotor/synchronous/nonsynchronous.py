@@ -10,7 +10,6 @@ Lines of motors: Randall, Vibration-based Condition Monitoring (2nd ed. 2021), s
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 import numpy as np
 import scipy.fft
 
+from daqsvc.dsp.drive_lines import GRID_SHARE, LINE_FREQUENCIES_HZ, slips
 from daqsvc.rotor.synchronous.positions import REVOLUTIONS, LastPositions
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
@@ -49,9 +49,6 @@ _BEATS = 2.0
 """Beats over which line and harmonic are told apart well."""
 _DIVISORS = (2, 3, 4)
 """A rub leaves lines at these parts of the speed."""
-_MAINS_HZ = (50.0, 60.0)
-_GRID_SHARE = 0.002
-"""How far a grid's frequency may be off."""
 _ABOUT_BINS = 40
 _SKIRT_BINS = (4, 10)
 _CORE_BINS = 2
@@ -59,11 +56,12 @@ _WINDOW_BINS = 1.5
 """Bins of noise that Hann's window lets through."""
 _APART_BINS = 2.5
 """Bins beside a harmonic where its own changes end up."""
+_KNOWN_BINS = 3.0
+"""The same, from which on a line stays known."""
 _HALF = 0.5
 """Part of a line below which it has ended."""
-_KNOWN_BINS = 3.0
-"""The same, from which on it stays known."""
 _DEVIATIONS = 4.0
+"""Of a stated speed, within which a line may be a harmonic."""
 _LINE_DB = 15.0
 """A line of the mains, of which it is known where it would be ..."""
 _ANY_LINE_DB = 20.0
@@ -83,13 +81,12 @@ _GRID_STEPS = 9
 _RIDGE = 1e-9
 """Keeps a fit from failing where two columns are alike."""
 _LEAST_OVER_NOISE = 30.0
+"""Power of the mains over that of noise in the same line, from which on they are found in a beat."""
 _ALL_OF_IT = 0.9
 """Part of all new motion that the mains must be where they are not resolved from a harmonic ..."""
 _NOT_STEADY = 0.8
 """... and the part of theirs that a steady orbit may explain then: what grows evenly is steady by 3/4, and is
 explained by a line by no more than that."""
-_MOST_SLIP = 0.08
-_MOST_POLE_PAIRS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +116,7 @@ class NonsynchronousLine:
     @property
     def beats(self) -> bool:
         """Whether it is so near a judged harmonic that the revolutions differ for many in turn."""
-        nearest = round(self.order)
-        return nearest in _JUDGED and abs(self.order - nearest) < _NEAR
+        return _is_near(self.order)
 
     @property
     def is_foreign(self) -> bool:
@@ -169,6 +165,11 @@ class Found(NamedTuple):
     line: NonsynchronousLine
     harmonics: Complexes | None
     revolutions: int
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether a part of a beat has shown it."""
+        return self.line.beats and self.harmonics is None
 
 
 class _Spectrum:
@@ -241,8 +242,15 @@ def _fitted(basis: Complexes, z: Complexes) -> Complexes:
     return np.asarray(np.linalg.solve(normal, basis.conj().T @ z))
 
 
-def new_line(
-    now: Stretch, before: Stretch | None, healthy: Calibration, speed_uncertainty: float = 0.0
+class _Before(NamedTuple):
+    """The machine before a change."""
+
+    stretch: Stretch
+    spectrum: _Spectrum
+
+
+def _new_line(
+    now: Stretch, before: _Before | None, healthy: Calibration, speed_uncertainty: float = 0.0
 ) -> Found | None:
     """The line beside the harmonics that came with a change: that of the mains, or else the strongest.
 
@@ -252,8 +260,6 @@ def new_line(
         healthy: its baseline.
         speed_uncertainty: relative standard deviation of the speed: a line as near to a harmonic may be it.
     """
-    if before is not None and before.revolutions < LEAST_REVOLUTIONS / 4:
-        before = None
     shaft_hz = float(now.revolutions * now.rate_hz / np.ptp(np.flatnonzero(now.there)))
     found = None
     if now.revolutions >= LEAST_REVOLUTIONS:
@@ -267,25 +273,24 @@ def new_line(
 
 
 def _standing_out(
-    now: Stretch, before: Stretch | None, shaft_hz: float, healthy: Calibration
+    now: Stretch, before: _Before | None, shaft_hz: float, healthy: Calibration
 ) -> Found | None:
     """The line of the spectrum that is new and at no harmonic; None if there is none."""
     spectrum = _Spectrum(now)
-    earlier = None if before is None else _Spectrum(before)
     candidates = [(_strongest(spectrum, shaft_hz), _ANY_LINE_DB, 1.0)]
     for hz, _ in _mains():
-        reach_hz = max(_GRID_SHARE * hz, spectrum.step_hz)
+        reach_hz = max(GRID_SHARE * hz, spectrum.step_hz)
         # The mains are among the strongest themselves where they are it.
         candidates.append((spectrum.peak(hz - reach_hz, hz + reach_hz), _LINE_DB, 2.0))
     best, at, modulates = 0.0, 0, None
     for peak, least_db, weight in candidates:
         if not peak or not _stands_out(spectrum, peak, shaft_hz, least_db):
             continue
-        if not _is_new(spectrum, peak, earlier):
+        if not _is_new(spectrum, peak, before):
             continue
         mirrored = _mirrored(spectrum, peak, shaft_hz)
         harmonic = round(peak * spectrum.step_hz / shaft_hz)
-        if mirrored and not (harmonic in _JUDGED and _is_near(peak * spectrum.step_hz / shaft_hz)):
+        if mirrored and not _is_near(peak * spectrum.step_hz / shaft_hz):
             continue
         if weight * spectrum.line(peak) > best:
             best, at, modulates = weight * spectrum.line(peak), peak, harmonic if mirrored else None
@@ -353,26 +358,24 @@ def _mains_in(line: NonsynchronousLine, revolutions: float, healthy: Calibration
 def _poles(often_hz: float, shaft_hz: float, revolutions: float) -> int | None:
     """Poles of an induction motor at this speed that pass its rotor bars so often; None if there is none."""
     resolution_hz = shaft_hz / max(revolutions, 1.0)
-    for mains_hz, pairs in itertools.product(_MAINS_HZ, range(1, _MOST_POLE_PAIRS + 1)):
-        slip_hz = mains_hz / pairs - shaft_hz
-        if not 0.0 < slip_hz < _MOST_SLIP * shaft_hz:
-            continue
+    for mains_hz in LINE_FREQUENCIES_HZ:
         # The poles pass at twice the slip of every pole pair; the slip is as exact as the mains.
-        allowed_hz = 2.0 * _GRID_SHARE * mains_hz + resolution_hz
-        if abs(often_hz - 2.0 * pairs * slip_hz) < allowed_hz:
-            return 2 * pairs
+        allowed_hz = 2.0 * GRID_SHARE * mains_hz + resolution_hz
+        for pairs, slip_hz in slips(mains_hz, shaft_hz):
+            if abs(often_hz - 2.0 * pairs * slip_hz) < allowed_hz:
+                return 2 * pairs
     return None
 
 
 def _mains() -> Iterator[tuple[float, Mains]]:
     """Frequencies where lines of the mains are."""
-    for mains_hz in _MAINS_HZ:
+    for mains_hz in LINE_FREQUENCIES_HZ:
         yield mains_hz, 1
         yield 2.0 * mains_hz, 2
 
 
 def _is_mains(frequency_hz: float, mains_hz: float) -> bool:
-    return abs(frequency_hz - mains_hz) < 1.5 * _GRID_SHARE * mains_hz
+    return abs(frequency_hz - mains_hz) < 1.5 * GRID_SHARE * mains_hz
 
 
 def _is_near(order: float) -> bool:
@@ -403,16 +406,16 @@ def _mirrored(spectrum: _Spectrum, at: int, shaft_hz: float) -> bool:
     return bool(spectrum.line(mirror) > 10.0 ** (-0.1 * _MIRROR_DB) * spectrum.line(at))
 
 
-def _is_new(spectrum: _Spectrum, at: int, earlier: _Spectrum | None) -> bool:
+def _is_new(spectrum: _Spectrum, at: int, before: _Before | None) -> bool:
     """Whether a line was not there before, or not nearly as strong."""
-    if earlier is None:
+    if before is None:
         return True
-    before = earlier.largest_about(at * spectrum.step_hz, spectrum.step_hz)
-    return bool(spectrum.line(at) > _NEW * before)
+    was = before.spectrum.largest_about(at * spectrum.step_hz, spectrum.step_hz)
+    return bool(spectrum.line(at) > _NEW * was)
 
 
 def _mains_in_a_beat(
-    now: Stretch, before: Stretch | None, shaft_hz: float, healthy: Calibration
+    now: Stretch, before: _Before | None, shaft_hz: float, healthy: Calibration
 ) -> Found | None:
     """The mains beside a harmonic, before a spectrum tells them apart; None if it is not them.
 
@@ -434,7 +437,7 @@ def _mains_in_a_beat(
     for hz, which in _mains():
         if not _is_near(hz / shaft_hz):
             continue
-        for share in np.linspace(-_GRID_SHARE, _GRID_SHARE, _GRID_STEPS):
+        for share in np.linspace(-GRID_SHARE, GRID_SHARE, _GRID_STEPS):
             square = float((np.abs(_sides(now, off, hz * (1.0 + share))) ** 2).sum())
             if square > best:
                 best, best_hz, mains = square, hz * (1.0 + share), which
@@ -445,7 +448,7 @@ def _mains_in_a_beat(
     if before is None:
         was = healthy.noise
     else:
-        was = float((np.abs(_sides(before, _off_orbit(before, healthy), best_hz)) ** 2).sum())
+        was = float((np.abs(_sides(before.stretch, _off_orbit(before.stretch, healthy), best_hz)) ** 2).sum())
     forward, backward = (float(abs(each)) for each in _sides(now, off, best_hz))
     if best < _NEW * was or (mains == 1 and _sense(forward, backward) is not None):
         return None
@@ -483,12 +486,11 @@ class NonsynchronousSearch:
     def __init__(self, rate_hz: float, speed_uncertainty: float = 0.0) -> None:
         self._speed_uncertainty = speed_uncertainty
         self._positions = LastPositions(rate_hz)
-        self._before: Stretch | None = None
+        self._before: _Before | None = None
         self._since: int | None = None
         self._next = 0
         self._found: Found | None = None
         self._shown_rev = 0.0
-        self._is_partial = False
         self._most_um = 0.0
 
     def add(self, revolution: int, first_index: int, turns: Floats, z: Complexes) -> None:
@@ -499,7 +501,9 @@ class NonsynchronousSearch:
         """The machine was healthy before a revolution, and is not any more."""
         if self._since is not None and onset - self._since < REVOLUTIONS:
             return  # a beat seems to end and to begin again
-        self._before = self._positions.stretch(onset - REVOLUTIONS, onset)
+        before = self._positions.stretch(onset - REVOLUTIONS, onset)
+        enough = before is not None and before.revolutions >= LEAST_REVOLUTIONS / 4
+        self._before = _Before(before, _Spectrum(before)) if before is not None and enough else None
         self._since, self._found = onset, None
         self._next = onset + _SETTLING + EVERY
 
@@ -515,24 +519,30 @@ class NonsynchronousSearch:
         self._next = revolution + EVERY
         begin = max(self._since + _SETTLING, revolution - REVOLUTIONS)
         now = self._positions.stretch(begin, revolution + 1)
-        known = self._found is not None and not self._is_partial
-        if known and (now is None or now.revolutions < self._shown_rev):
-            return self._found  # after a gap there are too few
-        if known and now is not None:
-            now = now.last(self._shown_rev)
-        found = None if now is None else new_line(now, self._before, healthy, self._speed_uncertainty)
-        if known and now is not None and self._found is not None and not _is_same(found, self._found):
-            found = _fitted_again(now, self._found.line, healthy)
-        if known and found is not None and found.line.amplitude_um < _HALF * self._most_um:
-            found = None
-        if found is None and self._found is not None:
-            self._since = revolution - EVERY
-        elif found is not None and now is not None and not known:
-            self._is_partial = found.line.beats and found.harmonics is None
-            self._shown_rev = min(_shown_by(now, found.line), REVOLUTIONS - 2.0 * EVERY)
-        self._found = found
-        self._most_um = 0.0 if found is None else max(self._most_um, found.line.amplitude_um)
-        return found
+        was = self._found
+        if was is not None and not was.is_partial:
+            if now is None or now.revolutions < self._shown_rev:
+                return was  # after a gap there are too few
+            self._found = self._followed(was.line, now.last(self._shown_rev), healthy)
+        else:
+            self._found = None if now is None else self._new_line(now, healthy)
+            if now is not None and self._found is not None:
+                self._shown_rev = min(_shown_by(now, self._found.line), REVOLUTIONS - 2.0 * EVERY)
+        if self._found is not None:
+            self._most_um = max(self._most_um, self._found.line.amplitude_um)
+        elif was is not None:
+            self._since, self._most_um = revolution - EVERY, 0.0
+        return self._found
+
+    def _followed(self, line: NonsynchronousLine, now: Stretch, healthy: Calibration) -> Found | None:
+        """A line that is known, by the last revolutions; None if it has ended."""
+        found = self._new_line(now, healthy)
+        if found is None or not _is_same(found.line, line):
+            found = _fitted_again(now, line, healthy)
+        return found if found.line.amplitude_um >= _HALF * self._most_um else None
+
+    def _new_line(self, now: Stretch, healthy: Calibration) -> Found | None:
+        return _new_line(now, self._before, healthy, self._speed_uncertainty)
 
 
 def _shown_by(now: Stretch, line: NonsynchronousLine) -> float:
@@ -542,11 +552,8 @@ def _shown_by(now: Stretch, line: NonsynchronousLine) -> float:
     return max(least, _KNOWN_BINS / apart) if line.beats else least
 
 
-def _is_same(found: Found | None, before: Found) -> bool:
-    """Whether a line that was found is what was found before."""
-    if found is None:
-        return False
-    now, then = found.line, before.line
+def _is_same(now: NonsynchronousLine, then: NonsynchronousLine) -> bool:
+    """Whether two lines are one, some revolutions later."""
     alike = (now.mains, now.modulates) == (then.mains, then.modulates)
     return alike and abs(now.order - then.order) < _NEAR
 

@@ -519,6 +519,12 @@ class Identification:
     line: NonsynchronousLine | None = None
     by_line: bool = False
 
+    def describe_line(self) -> str:
+        """One sentence about the line; empty if there is none."""
+        if self.line is None:
+            return ""
+        return self.line.describe() + ("; no fault of the rotor" if self.by_line else "")
+
 
 class WithoutLine(NamedTuple):
     """The change of the harmonics without a line that beats with one of them.

@@ -275,7 +275,7 @@ class RotorWatch:
                     self._identify(row.revolution, may_name=True)
                     looked = True
             looked = self._maybe_look(row.revolution) or looked
-            departed = self._turns(before, row.revolution)
+            departed = self._changes_again(before, row.revolution)
         elif settled and rate_known:
             self._learn(row)
         return self._report(one, evidence, departed=departed, looked=looked)
@@ -389,7 +389,7 @@ class RotorWatch:
             return False
         return now.by_line or now.line.modulates is None
 
-    def _turns(self, before: Identification | None, revolution: int) -> bool:
+    def _changes_again(self, before: Identification | None, revolution: int) -> bool:
         """Begin a new segment where a line has ended, or a fault has begun or ended beside one.
 
         Args:

@@ -485,6 +485,8 @@ def test_the_mains_are_stated_with_their_frequency_and_no_fault_is_named():
     diagnoses = run(detector(), samples)
     assert diagnoses[-1].decision == "unmodelled"
     assert diagnoses[-1].group == ()
+    assert diagnoses[-1].quality == "good"
+    assert "these are the mains, as cables pick them up; no fault of the rotor" in diagnoses[-1].reason
     statistics, units = diagnoses[-1].statistics, diagnoses[-1].units
     assert statistics["line.frequency"] == pytest.approx(60.0, abs=0.1)
     assert statistics["line.order"] == pytest.approx(2.4, abs=0.005)
