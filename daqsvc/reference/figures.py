@@ -28,6 +28,8 @@ class Figure(NamedTuple):
 
 
 _OF_SENSOR = "of the sensor"
+_PER_REVOLUTION = "the same per revolution of the shaft"
+_LINE_AMPLITUDE = "root mean square radius of its motion"
 FIGURES: Mapping[str, Mapping[str, Figure]] = {
     LEVELS: {
         "mean": Figure(_OF_SENSOR, "mean of the window"),
@@ -57,6 +59,11 @@ FIGURES: Mapping[str, Mapping[str, Figure]] = {
         "misfit": Figure(
             "", "part of a steady change that the declared mode does not explain, with two modes"
         ),
+        "line.frequency": Figure(
+            "Hz", "of a line that is at no harmonic of the shaft and none of the rotor's, and is left out"
+        ),
+        "line.order": Figure("", _PER_REVOLUTION),
+        "line.amplitude": Figure("um", _LINE_AMPLITUDE),
     },
     ROTOR_SYNCHRONOUS: {
         "speed": Figure("rpm", "speed of the shaft in the last revolution"),
@@ -72,8 +79,8 @@ FIGURES: Mapping[str, Mapping[str, Figure]] = {
         "line.frequency": Figure(
             "Hz", "of a line that came with the change and is at no harmonic of the shaft, if one stands out"
         ),
-        "line.order": Figure("", "the same per revolution of the shaft"),
-        "line.amplitude": Figure("um", "root mean square radius of its motion"),
+        "line.order": Figure("", _PER_REVOLUTION),
+        "line.amplitude": Figure("um", _LINE_AMPLITUDE),
         "FAULT.ratio": Figure("", "`unbalance`: 1X vector after over before the change"),
         "FAULT.change_um": Figure(
             "um",
@@ -133,6 +140,7 @@ def _makers() -> Mapping[str, tuple[tuple[str, Callable[..., object]], ...]]:
     from daqsvc.detectors.rotor_bank.statements import BankDiagnosisBuilder  # noqa: PLC0415
     from daqsvc.detectors.rotor_synchronous.statements import Stater  # noqa: PLC0415
     from daqsvc.rotor.synchronous import severity  # noqa: PLC0415
+    from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousLine  # noqa: PLC0415
 
     sizes = [
         one
@@ -141,8 +149,12 @@ def _makers() -> Mapping[str, tuple[tuple[str, Callable[..., object]], ...]]:
     ]
     return {
         LEVELS: (("", LevelDetector._measure),),  # noqa: SLF001 - its text is read, nothing is called
-        ROTOR_BANK: (("", BankDiagnosisBuilder.state),),
-        ROTOR_SYNCHRONOUS: (("", Stater._statistics), *(("FAULT.", one) for one in sizes)),  # noqa: SLF001
+        ROTOR_BANK: (("", BankDiagnosisBuilder.state), ("", NonsynchronousLine.figures)),
+        ROTOR_SYNCHRONOUS: (
+            ("", Stater._statistics),  # noqa: SLF001
+            ("", NonsynchronousLine.figures),
+            *(("FAULT.", one) for one in sizes),
+        ),
         BEARING: (("", figures_of),),
     }
 

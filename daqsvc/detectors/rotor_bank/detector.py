@@ -27,6 +27,7 @@ from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
+from daqsvc.rotor.line_removal import LineRemoval
 from daqsvc.rotor.misfit import (
     Misfit,
     SteadyChange,
@@ -38,6 +39,7 @@ from daqsvc.rotor.misfit import (
     swing,
 )
 from daqsvc.rotor.steady_faults import Explanation, SteadyFaults, narrowed
+from daqsvc.rotor.synchronous.nonsynchronous import HealthyOrbit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.model import NormalisedRotor, RotorParameters
+    from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousLine
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
@@ -117,6 +120,10 @@ class RotorBankDetector:
     The signatures also know faults that the bank has no mode of, and changes that no fault explains. These
     are in the group then by their own names, as ``stiffness_loss`` or ``unmodelled``. Where they explain the
     change much better than any mode, they are the decision. The nearest mode would be a wrong name.
+
+    While the machine is not healthy, lines beside the shaft's harmonics are looked for. One that is none of
+    the rotor's, as the mains, is taken out of the positions for as long as it is there. The observers then
+    judge what is left, `reason` states the line, and ``line.*`` its figures (`daqsvc.rotor.line_removal`).
 
     A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
     guess, the observers start again. While the quality is not good there is no evidence, and the decision is
@@ -237,6 +244,7 @@ class RotorBankDetector:
                 f"rotor bank of {machine!r}: calibrate_revolutions is {calibrate_revolutions}; "
                 "write 0 to trust the stated rotor, or 20 or more"
             )
+        self._lines = LineRemoval(rate_hz, rotor.clearance_um, clockwise=speed_rpm < 0.0)
         self._calibrate_revolutions = calibrate_revolutions
         self._calibration = SteadyFit() if calibrate_revolutions else None
         self._calibrated_speed = math.nan
@@ -261,6 +269,11 @@ class RotorBankDetector:
     def knows_other_faults(self) -> bool:
         """Whether it also knows faults that it has no mode of, and changes that no fault explains."""
         return self._steady_faults is not None
+
+    @property
+    def line(self) -> NonsynchronousLine | None:
+        """The line beside the shaft's harmonics that is left out of the positions; None if there is none."""
+        return self._lines.line
 
     @property
     def bank_modes(self) -> tuple[BankMode, ...]:
@@ -323,6 +336,7 @@ class RotorBankDetector:
         if window.breaks:
             # At which angle the shaft is by now, only the next pulses show; its speed is what it was.
             self._begin_anew(keep_speed=True)
+            self._lines.forget()
         elif 0 < gap <= self._nominal_period:
             samples = np.concatenate((np.full((gap, 3), np.nan), samples))
             first_index -= gap
@@ -374,6 +388,7 @@ class RotorBankDetector:
         xy = samples[:, :2] @ self._to_xy
         if stands_still(samples[:, :2]):
             xy[:] = np.nan
+        xy = self._lines.without(first_index, track.angle_rad, xy, revolution)
         self._watch.add(xy, cos, sin, revolution)
         verdict = self._verdict()
         self._follow_speed(float(angle[0]))
@@ -397,6 +412,7 @@ class RotorBankDetector:
         if math.floor(self._revolutions) > math.floor(before):
             self._speeds.append(self._bank.speed)
             self._compare_steady(report)
+            self._look_for_line(report)
             began, self._progress_index = self._progress_index, end_index
             changed = self._take_besides()
             if changed:
@@ -478,6 +494,29 @@ class RotorBankDetector:
             self._decision = self._modes[mode].name
         others = [set() if one is None else set(one.others) for one in (before, now)]
         return self._decision != stated or others[0] != others[1]
+
+    def _look_for_line(self, report: BankReport) -> None:
+        """Take a line out from now on, or none any more: what the observers saw is of another motion then."""
+        bank = self._bank
+        if self._rules.rule != "cusum" or bank.decision == UNDETERMINED or self._calibration is not None:
+            return
+        if not self._lines.look(self._healthy_orbit, healthy=bank.decision == 0 and report.departure is None):
+            return
+        count = len(self._modes)
+        bank.reseed()
+        bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
+        self._watch.spoil()
+        self._change.off = None
+        if self._steady_faults is not None:
+            self._steady_faults.forget()
+
+    def _healthy_orbit(self) -> HealthyOrbit:
+        """The healthy motion at this speed, seen from where the shaft turns counter-clockwise."""
+        rotor, w = self._bank_modes[0].rotor, self._bank.speed
+        parts = (rotor.rest, rotor.orbit(w), rotor.backward_orbit(w), *self._harmonics[:2])
+        baseline: Complexes = self._clearance_um * np.array(parts, dtype=np.complex128)
+        noise = 2.0 * (self._noise * self._clearance_um) ** 2
+        return HealthyOrbit(baseline.conj() if self._direction < 0.0 else baseline, noise, self._clearance_um)
 
     def _compare_steady(self, report: BankReport) -> None:
         """Leave out the modes that the steady motion is too far from, also the healthy one."""
@@ -674,6 +713,7 @@ class RotorBankDetector:
             changed=changed,
             off=self._change.off,
             besides=self._change.besides,
+            line=self._lines.line,
             missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
         )
 

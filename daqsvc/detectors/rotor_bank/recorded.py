@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.diagnosis.recorded import Progress, Recorded, Statements
     from daqsvc.recording.recording import Recording
+    from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousLine
     from daqsvc.rotor.synchronous.signatures import RotorFault
 
 
@@ -55,7 +56,11 @@ class RecordedBank(RecordedDetector[RotorBank]):
         return Evaluated(
             (statements,),
             bank_verdict(
-                recorded.recording, statements, detector.faults, closed=not detector.knows_other_faults
+                recorded.recording,
+                statements,
+                detector.faults,
+                closed=not detector.knows_other_faults,
+                line=detector.line,
             ),
             partial(_draw, recorded.recording, statements, tuple(detector.faults)),
         )
@@ -68,7 +73,12 @@ def _draw(recording: Recording, statements: Statements, modes: tuple[str, ...], 
 
 
 def bank_verdict(
-    recording: Recording, statements: Statements, faults: Mapping[str, str], *, closed: bool
+    recording: Recording,
+    statements: Statements,
+    faults: Mapping[str, str],
+    *,
+    closed: bool,
+    line: NonsynchronousLine | None = None,
 ) -> RotorVerdict:
     """What a recording reports about a rotor by its bank alone.
 
@@ -79,6 +89,7 @@ def bank_verdict(
         statements: all that the bank stated.
         faults: the fault that each mode represents.
         closed: whether the bank knows its modes and nothing else.
+        line: that it leaves out at the end.
     """
     quality = known_against(recording)
     source = str(recording.source)
@@ -115,6 +126,7 @@ def bank_verdict(
         named=_fault(last.decision, faults) is not None,
         probabilities=chances,
         evidence=cast("dict[RotorFault, float]", dict(last.evidence)),
+        left_out=line,
         onset=_instant(onset, recording.rate_hz, last) if changed and onset is not None else None,
         departure=_instant(departed.end_index, recording.rate_hz, departed) if changed and departed else None,
         declaration=_instant(named.end_index, recording.rate_hz, named) if changed and named else None,

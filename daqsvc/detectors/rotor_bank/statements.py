@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from daqsvc.rotor.decision import DecisionRules
     from daqsvc.rotor.misfit import Misfit
     from daqsvc.rotor.steady_faults import Explanation
+    from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousLine
 
     Flags = NDArray[np.bool_]
     Floats = NDArray[np.float64]
@@ -32,6 +33,7 @@ DEPARTURE = "departure"
 """Decision while the machine has left the declared mode and the cause is not yet known."""
 
 UNDETERMINED_DECISION = "undetermined"
+_UNITS = {"speed": "rpm", "line.frequency": "Hz", "line.amplitude": "um"}
 _LEAST_PROBABILITY = 1e-300
 _SEVERITIES: tuple[Severity, ...] = ("normal", "alert", "danger")
 
@@ -90,6 +92,7 @@ class BankDiagnosisBuilder:
         changed: bool,
         off: Misfit | None,
         besides: Explanation | None,
+        line: NonsynchronousLine | None,
         missing_share: float,
     ) -> Diagnosis:
         """A diagnosis.
@@ -103,6 +106,7 @@ class BankDiagnosisBuilder:
             changed: whether this states a change.
             off: how the modes miss the steady change; None where none was compared.
             besides: what else than the modes explains it; None where nothing does.
+            line: that is left out of the positions.
             missing_share: share of the samples of the last revolution that are missing.
         """
         names = [mode.name for mode in self.modes]
@@ -132,6 +136,8 @@ class BankDiagnosisBuilder:
         statistics |= {f"paper.{name}": float(p) for name, p in zip(names, paper, strict=True)}
         if off is not None and not math.isnan(missed := float(off.part[decision])):
             statistics["misfit"] = missed
+        if line is not None:
+            statistics |= line.figures()
         return Diagnosis(
             machine=self.machine,
             detector=self.detector,
@@ -145,7 +151,7 @@ class BankDiagnosisBuilder:
             probabilities=chances | {name: 0.0 for name in self.others if name not in chances},
             group=group,
             statistics=statistics,
-            units={"speed": "rpm"},
+            units={name: unit for name, unit in _UNITS.items() if name in statistics},
             thresholds={
                 "cusum": self.rules.threshold_nats,
                 "cusum.back": self.rules.back_threshold_nats,
@@ -154,7 +160,7 @@ class BankDiagnosisBuilder:
             evidence=evidence,
             revolutions=moment.revolutions,
             quality=verdict.quality,
-            reason=verdict.reason,
+            reason=verdict.reason or ("" if line is None else line.describe(left_out=True)),
             sensors=self.sensors,
             model=MODEL,
             missing_share=missing_share,

@@ -249,11 +249,7 @@ class Stater:
         if report is not None and report.identification is not None:
             statistics["severity"] = report.identification.severity
             if (line := report.identification.line) is not None:
-                statistics |= {
-                    "line.frequency": line.frequency_hz,
-                    "line.order": line.order,
-                    "line.amplitude": line.amplitude_um,
-                }
+                statistics |= line.figures()
             if calibration is not None and report.identification.named:
                 statistics |= self._levels(report.identification, calibration)
         return statistics

@@ -106,7 +106,7 @@ class CalibrationJson(TypedDict):
 
 
 class LineJson(TypedDict):
-    """A line that came with a change and is at no harmonic of the shaft.
+    """A line at no harmonic of the shaft: it came with a change, or the bank has left it out.
 
     Attributes:
         frequency_hz: where it is.
@@ -142,7 +142,8 @@ class RotorVerdictJson(TypedDict):
         severity: size of the change over the amplitude of the healthy whirl; null if healthy.
         level: by fault of the group how large it would be, in its own terms.
         change_um: by order the change of the vector, real and imaginary part; null if healthy.
-        line: that came with the change beside the shaft's harmonics; null if none stands out.
+        line: beside the shaft's harmonics, that came with the change, or is left out; null if none stands
+            out.
         onset: estimated begin of the change; null if there is none.
         departure: where the alarm was raised; null if it was not.
         declaration: where the last group was first named; null if it was not.
@@ -301,6 +302,7 @@ class RotorVerdict(Verdict):
         level: how large each fault of the group would be, in its own terms
             (`daqsvc.rotor.synchronous.severity`).
         identification: what the last evaluation saw; None while the machine is healthy.
+        left_out: line that the bank leaves out of the positions at the end; None if there is none.
         onset: estimated begin of the change.
         departure: where the alarm is raised.
         declaration: where the final group was first named.
@@ -325,6 +327,7 @@ class RotorVerdict(Verdict):
     severity: float | None = None
     level: Mapping[RotorFault, Mapping[str, float]] = field(default_factory=dict)
     identification: Identification | None = None
+    left_out: NonsynchronousLine | None = None
     onset: Instant | None = None
     departure: Instant | None = None
     declaration: Instant | None = None
@@ -400,6 +403,8 @@ class RotorVerdict(Verdict):
                 for fault, level in self.level.items()
                 if level
             ]
+        if self.left_out is not None:
+            lines.append(self.left_out.describe(left_out=True))
         if self.calibration is not None:
             was = self.calibration
             lines.append(
@@ -452,6 +457,8 @@ class RotorVerdict(Verdict):
 
     def _line(self) -> LineJson | None:
         now = self.identification
+        if self.left_out is not None:
+            return _line_json(self.left_out, is_the_change=self.verdict == "normal")
         return None if now is None or now.line is None else _line_json(now.line, is_the_change=now.by_line)
 
     def _named(self) -> str:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.positions import Stretch
 
     Complexes = NDArray[np.complex128]
@@ -39,8 +38,8 @@ EVERY = 16
 """Revolutions from one evaluation to the next, at least."""
 _SETTLING = 8
 """Revolutions after a change in which the rotor is on its way."""
-_HIGHEST = 6
-"""Harmonics that are taken out; lines are looked for up to the next one, and twice the mains anywhere."""
+_HIGHEST = 7.0
+"""Order up to which lines are looked for, but for those of the mains."""
 _JUDGED = (1, 2, 3)
 """Harmonics that a rotor is judged by."""
 _NEAR = 1.0 / 16.0
@@ -78,8 +77,6 @@ _OIL_WHIRL = (0.35, 0.5)
 _MOST_OF_CLEARANCE = 0.5
 """No mains move a signal by more than this part of the clearance."""
 _GRID_STEPS = 9
-_RIDGE = 1e-9
-"""Keeps a fit from failing where two columns are alike."""
 _LEAST_OVER_NOISE = 30.0
 """Power of the mains over that of noise in the same line, from which on they are found in a beat."""
 _ALL_OF_IT = 0.9
@@ -113,6 +110,14 @@ class NonsynchronousLine:
     poles: int | None = None
     share: float = 1.0
 
+    def figures(self) -> dict[str, float]:
+        """Its figures in a diagnosis; in Hz and um."""
+        return {
+            "line.frequency": self.frequency_hz,
+            "line.order": self.order,
+            "line.amplitude": self.amplitude_um,
+        }
+
     @property
     def beats(self) -> bool:
         """Whether it is so near a judged harmonic that the revolutions differ for many in turn."""
@@ -123,10 +128,14 @@ class NonsynchronousLine:
         """Whether it is none of the rotor's: of the mains, or one that beats with a harmonic."""
         return self.mains > 0 or self.beats
 
-    def describe(self) -> str:
-        """One sentence for a person."""
+    def describe(self, *, left_out: bool = False) -> str:
+        """One sentence for a person.
+
+        Args:
+            left_out: whether it is said of positions that it is taken out of, and not of a change.
+        """
         if self.modulates is not None:
-            return self._modulation(self.modulates)
+            return self._modulation(self.modulates, left_out=left_out)
         line = f"a line of {self.amplitude_um:.3g} um at {self.frequency_hz:.2f} Hz ({self.order:.4g}X)"
         if self.mains == 2:
             what = "it is at twice the mains, as an induction motor pulls"
@@ -137,19 +146,38 @@ class NonsynchronousLine:
             what = f"it goes {sense}, at no harmonic of the shaft"
             if any(_is_mains(self.frequency_hz, hz) for hz, _ in _mains()):
                 what += "; the mains have this frequency, too"
-        return f"{line} came with the change: {what}"
+        return f"{line} {'is left out' if left_out else 'came with the change'}: {what}"
 
-    def _modulation(self, harmonic: int) -> str:
+    def _modulation(self, harmonic: int, *, left_out: bool) -> str:
         often_hz = abs(self.frequency_hz - harmonic * self.frequency_hz / self.order)
         sentence = (
-            f"{harmonic}X is modulated at {often_hz:.2f} Hz since the change, by lines of "
-            f"{self.amplitude_um:.3g} um on either side"
+            f"{harmonic}X is modulated at {often_hz:.2f} Hz{'' if left_out else ' since the change'}, by "
+            f"lines of {self.amplitude_um:.3g} um on either side{', which are left out' if left_out else ''}"
         )
         if self.poles is not None:
             sentence += (
                 f": as often as the poles of an induction motor of {self.poles} poles pass its rotor bars"
             )
         return sentence
+
+
+class HealthyOrbit(NamedTuple):
+    """What is known of the machine before a change.
+
+    Attributes:
+        baseline: complex128 ``[5]``, its synchronous vector, um.
+        noise: variance of a complex sample that does not repeat with the shaft, um^2.
+        clearance_um: radial; None if not known.
+    """
+
+    baseline: Complexes
+    noise: float
+    clearance_um: float | None
+
+    @property
+    def amplitude_um(self) -> float:
+        """Modulus of the forward 1X vector."""
+        return float(abs(self.baseline[1]))
 
 
 class Found(NamedTuple):
@@ -180,10 +208,9 @@ class _Spectrum:
     """
 
     def __init__(self, stretch: Stretch) -> None:
-        basis = _harmonics(stretch) * stretch.there[:, np.newaxis]
-        fit = _fitted(basis, stretch.z)
+        harmonics = stretch.harmonics
         window = np.hanning(len(stretch.z) + 1)[:-1] * stretch.there
-        left = scipy.fft.fft((stretch.z - basis @ fit) * window)
+        left = scipy.fft.fft((stretch.z - harmonics @ stretch.fit(harmonics)) * window)
         sides: Floats = np.abs(left) ** 2 / (_WINDOW_BINS * max(float(window.sum()) ** 2, 1.0))
         self.step_hz = stretch.rate_hz / len(stretch.z)
         count = len(sides) // 2
@@ -225,23 +252,6 @@ class _Spectrum:
         return self.line(at) if at else 0.0
 
 
-def _harmonics(stretch: Stretch) -> Complexes:
-    """Harmonics of the shaft, complex128 ``[n, 2 H + 1]``: `HARMONICS`, then all others that show."""
-    turning = np.exp(2j * math.pi * stretch.turns)
-    points_per_rev = len(stretch.z) / max(stretch.revolutions, 1.0)
-    # With fewer points two of them are one.
-    highest = max(2, min(_HIGHEST, math.ceil(points_per_rev / 2.0) - 1))
-    others = [k for k in range(-highest, highest + 1) if k not in HARMONICS]
-    return np.stack([turning**k for k in (*HARMONICS, *others)], axis=1)
-
-
-def _fitted(basis: Complexes, z: Complexes) -> Complexes:
-    """Least-squares coefficients of columns that are nearly orthogonal."""
-    normal = basis.conj().T @ basis
-    normal += _RIDGE * len(basis) * np.eye(len(normal))
-    return np.asarray(np.linalg.solve(normal, basis.conj().T @ z))
-
-
 class _Before(NamedTuple):
     """The machine before a change."""
 
@@ -250,7 +260,7 @@ class _Before(NamedTuple):
 
 
 def _new_line(
-    now: Stretch, before: _Before | None, healthy: Calibration, speed_uncertainty: float = 0.0
+    now: Stretch, before: _Before | None, healthy: HealthyOrbit, speed_uncertainty: float = 0.0
 ) -> Found | None:
     """The line beside the harmonics that came with a change: that of the mains, or else the strongest.
 
@@ -273,7 +283,7 @@ def _new_line(
 
 
 def _standing_out(
-    now: Stretch, before: _Before | None, shaft_hz: float, healthy: Calibration
+    now: Stretch, before: _Before | None, shaft_hz: float, healthy: HealthyOrbit
 ) -> Found | None:
     """The line of the spectrum that is new and at no harmonic; None if there is none."""
     spectrum = _Spectrum(now)
@@ -301,7 +311,7 @@ def _standing_out(
 
 
 def _described(
-    now: Stretch, frequency_hz: float, shaft_hz: float, healthy: Calibration, modulates: int | None
+    now: Stretch, frequency_hz: float, shaft_hz: float, healthy: HealthyOrbit, modulates: int | None
 ) -> Found:
     """A line of this frequency, and the harmonics without it."""
     order = frequency_hz / shaft_hz
@@ -315,8 +325,8 @@ def _described(
         frequencies.append(2.0 * modulates * shaft_hz - frequency_hz)
     seconds = np.arange(len(part.z)) / part.rate_hz
     going = [np.exp(2j * math.pi * sign * hz * seconds) for hz in frequencies for sign in (1.0, -1.0)]
-    basis = np.column_stack((_harmonics(part), *going)) * part.there[:, np.newaxis]
-    fit = _fitted(basis, part.z)
+    basis = np.column_stack((part.harmonics, *going))
+    fit = part.fit(basis)
     harmonics, sides = fit[: len(HARMONICS)], np.abs(fit[-len(going) :])
     forward, backward = float(sides[0]), float(sides[1])
     amplitude_um = math.sqrt(float((sides**2).sum()))
@@ -337,10 +347,10 @@ def _sense(forward: float, backward: float) -> bool | None:
     return None if min(forward, backward) > _FLAT * max(forward, backward) else forward > backward
 
 
-def _mains_in(line: NonsynchronousLine, revolutions: float, healthy: Calibration) -> Mains:
+def _mains_in(line: NonsynchronousLine, revolutions: float, healthy: HealthyOrbit) -> Mains:
     """Whether a line is of the mains: it is where they are, and nothing of the rotor can be it."""
     mains: Mains = next((m for hz, m in _mains() if _is_mains(line.frequency_hz, hz)), 0)
-    clearance_um, order = healthy.rotor.clearance_um, line.order
+    clearance_um, order = healthy.clearance_um, line.order
     if clearance_um is not None and line.amplitude_um > _MOST_OF_CLEARANCE * clearance_um:
         return 0
     # What a rub leaves at a part of the speed may be at the mains by chance.
@@ -387,7 +397,7 @@ def _strongest(spectrum: _Spectrum, shaft_hz: float) -> int:
     """The strongest bin that is beside the harmonics."""
     orders = np.arange(len(spectrum.power)) * (spectrum.step_hz / shaft_hz)
     beside = np.abs(orders - np.round(orders)) * shaft_hz > _APART_BINS * spectrum.step_hz
-    return int(np.where(beside & (orders < _HIGHEST + 1.0), spectrum.power, 0.0).argmax())
+    return int(np.where(beside & (orders < _HIGHEST), spectrum.power, 0.0).argmax())
 
 
 def _stands_out(spectrum: _Spectrum, at: int, shaft_hz: float, least_db: float) -> bool:
@@ -415,7 +425,7 @@ def _is_new(spectrum: _Spectrum, at: int, before: _Before | None) -> bool:
 
 
 def _mains_in_a_beat(
-    now: Stretch, before: _Before | None, shaft_hz: float, healthy: Calibration
+    now: Stretch, before: _Before | None, shaft_hz: float, healthy: HealthyOrbit
 ) -> Found | None:
     """The mains beside a harmonic, before a spectrum tells them apart; None if it is not them.
 
@@ -428,7 +438,7 @@ def _mains_in_a_beat(
         shaft_hz: revolutions per second.
         healthy: the baseline.
     """
-    off = _off_orbit(now, healthy)
+    off = now.off(healthy.baseline).z
     count = int(now.there.sum())
     noise = healthy.noise / now.averaged
     moves = max(float((np.abs(off) ** 2).sum()) / count - noise, 1e-12)
@@ -441,14 +451,15 @@ def _mains_in_a_beat(
             square = float((np.abs(_sides(now, off, hz * (1.0 + share))) ** 2).sum())
             if square > best:
                 best, best_hz, mains = square, hz * (1.0 + share), which
-    steady = float((np.abs(_harmonics(now).conj().T @ off / count) ** 2).sum())
+    steady = float((np.abs(now.harmonics.conj().T @ off / count) ** 2).sum())
     loud = best > _LEAST_OVER_NOISE * noise / count
     if not loud or best < _ALL_OF_IT * moves or steady > _NOT_STEADY * best:
         return None
     if before is None:
         was = healthy.noise
     else:
-        was = float((np.abs(_sides(before.stretch, _off_orbit(before.stretch, healthy), best_hz)) ** 2).sum())
+        off_before = before.stretch.off(healthy.baseline).z
+        was = float((np.abs(_sides(before.stretch, off_before, best_hz)) ** 2).sum())
     forward, backward = (float(abs(each)) for each in _sides(now, off, best_hz))
     if best < _NEW * was or (mains == 1 and _sense(forward, backward) is not None):
         return None
@@ -460,12 +471,6 @@ def _mains_in_a_beat(
         mains=mains,
     )
     return Found(line, None, round(now.revolutions))
-
-
-def _off_orbit(stretch: Stretch, healthy: Calibration) -> Complexes:
-    """Positions off the healthy orbit, complex128 ``[n]``, um; 0 where missing."""
-    orbit = _harmonics(stretch)[:, : len(HARMONICS)] @ healthy.baseline
-    return np.where(stretch.there, stretch.z - orbit, 0.0)
 
 
 def _sides(stretch: Stretch, off: Complexes, hz: float) -> Complexes:
@@ -497,6 +502,21 @@ class NonsynchronousSearch:
         """Keep a revolution; see `LastPositions.add`."""
         self._positions.add(revolution, first_index, turns, z)
 
+    def last(self, revolutions: float) -> Stretch | None:
+        """The last revolutions, or as many of them as there are; None if too much is missing."""
+        end = self._positions.end
+        return self._positions.stretch(end - math.ceil(revolutions), end)
+
+    def begin(self, revolution: int) -> None:
+        """Look for all lines from a revolution on, however long they have been there."""
+        self._before, self._since, self._found = None, revolution, None
+        self._next = revolution + _SETTLING + EVERY
+
+    def forget(self) -> None:
+        """Keep nothing of what was, as after a gap whose length is a guess."""
+        self._positions.forget()
+        self._since, self._found, self._most_um = None, None, 0.0
+
     def depart(self, onset: int) -> None:
         """The machine was healthy before a revolution, and is not any more."""
         if self._since is not None and onset - self._since < REVOLUTIONS:
@@ -507,7 +527,7 @@ class NonsynchronousSearch:
         self._since, self._found = onset, None
         self._next = onset + _SETTLING + EVERY
 
-    def evaluate(self, revolution: int, healthy: Calibration) -> Found | None:
+    def evaluate(self, revolution: int, healthy: HealthyOrbit) -> Found | None:
         """The line that came with the change, by all revolutions up to now, or nearly all.
 
         Args:
@@ -534,14 +554,14 @@ class NonsynchronousSearch:
             self._since, self._most_um = revolution - EVERY, 0.0
         return self._found
 
-    def _followed(self, line: NonsynchronousLine, now: Stretch, healthy: Calibration) -> Found | None:
+    def _followed(self, line: NonsynchronousLine, now: Stretch, healthy: HealthyOrbit) -> Found | None:
         """A line that is known, by the last revolutions; None if it has ended."""
         found = self._new_line(now, healthy)
         if found is None or not _is_same(found.line, line):
             found = _fitted_again(now, line, healthy)
         return found if found.line.amplitude_um >= _HALF * self._most_um else None
 
-    def _new_line(self, now: Stretch, healthy: Calibration) -> Found | None:
+    def _new_line(self, now: Stretch, healthy: HealthyOrbit) -> Found | None:
         return _new_line(now, self._before, healthy, self._speed_uncertainty)
 
 
@@ -553,12 +573,12 @@ def _shown_by(now: Stretch, line: NonsynchronousLine) -> float:
 
 
 def _is_same(now: NonsynchronousLine, then: NonsynchronousLine) -> bool:
-    """Whether two lines are one, some revolutions later."""
-    alike = (now.mains, now.modulates) == (then.mains, then.modulates)
+    """Whether two lines are one, some revolutions later; more of them may show whose it is."""
+    alike = now.modulates == then.modulates and then.mains in {0, now.mains}
     return alike and abs(now.order - then.order) < _NEAR
 
 
-def _fitted_again(now: Stretch, line: NonsynchronousLine, healthy: Calibration) -> Found:
+def _fitted_again(now: Stretch, line: NonsynchronousLine, healthy: HealthyOrbit) -> Found:
     """A line that was known, as a fault beside it may hide it in the spectrum."""
     shaft_hz = line.frequency_hz / line.order
     fitted = _described(now, line.frequency_hz, shaft_hz, healthy, line.modulates)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.rotor.synchronous.vectors import HARMONICS
+
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     Complexes = NDArray[np.complex128]
@@ -20,6 +25,10 @@ _POINTS_PER_REV = 32
 _MOST_MISSING = 0.3
 _LONG_GAP = 0.5
 """Revolutions that may be lost without being counted."""
+_HIGHEST = 6
+"""Harmonics that are fitted."""
+_RIDGE = 1e-9
+"""Keeps a fit from failing where two columns are alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +41,7 @@ class Stretch:
         there: bool ``[n]``.
         rate_hz: of the positions.
         averaged: samples in each.
+        first: number of the first position, on the grid that begins with sample 0.
     """
 
     z: Complexes
@@ -39,6 +49,7 @@ class Stretch:
     there: NDArray[np.bool_]
     rate_hz: float
     averaged: int
+    first: int
 
     @property
     def revolutions(self) -> float:
@@ -50,7 +61,56 @@ class Stretch:
         """Its last revolutions alone."""
         known = self.turns[self.there]
         begin = int(np.flatnonzero(self.there & (self.turns >= known[-1] - revolutions))[0])
-        return replace(self, z=self.z[begin:], turns=self.turns[begin:], there=self.there[begin:])
+        return replace(
+            self,
+            z=self.z[begin:],
+            turns=self.turns[begin:],
+            there=self.there[begin:],
+            first=self.first + begin,
+        )
+
+    @property
+    def orders(self) -> list[int]:
+        """Harmonics of the shaft that its positions show: `HARMONICS`, then all others."""
+        points_per_rev = len(self.z) / max(self.revolutions, 1.0)
+        # With fewer points two of them are one.
+        highest = max(2, min(_HIGHEST, math.ceil(points_per_rev / 2.0) - 1))
+        return [*HARMONICS, *(k for k in range(-highest, highest + 1) if k not in HARMONICS)]
+
+    @property
+    def harmonics(self) -> Complexes:
+        """Motions at `orders`, complex128 ``[n, H]``."""
+        return turning(self.turns, self.orders)
+
+    def off(self, baseline: Complexes) -> Stretch:
+        """Its positions off an orbit, complex128 ``[5]``, the amplitudes of `HARMONICS` in um."""
+        orbit = turning(self.turns, HARMONICS) @ baseline
+        return replace(self, z=np.where(self.there, self.z - orbit, 0.0))
+
+    def fit(self, *columns: Complexes) -> Complexes:
+        """Least-squares amplitudes of motions that are nearly orthogonal.
+
+        Args:
+            columns: complex128 ``[n, ...]`` each, motions of amplitude 1.
+
+        Returns:
+            complex128, of all columns.
+        """
+        basis = np.column_stack(columns) * self.there[:, np.newaxis]
+        normal = basis.conj().T @ basis
+        normal += _RIDGE * len(basis) * np.eye(len(normal))
+        return np.asarray(np.linalg.solve(normal, basis.conj().T @ self.z))
+
+
+def turning(turns: Floats, orders: Iterable[int]) -> Complexes:
+    """Motions of amplitude 1 at harmonics of the shaft, complex128 ``[n, H]``.
+
+    Args:
+        turns: float64 ``[n]``, shaft angle in revolutions.
+        orders: ``[H]``, negative ones against the shaft.
+    """
+    once = np.exp(2j * math.pi * turns)
+    return np.stack([once**k for k in orders], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +137,16 @@ class LastPositions:
         self._next = -1
         self._rest_z: Complexes = np.empty(0, dtype=np.complex128)
         self._rest_turns: Floats = np.empty(0)
+
+    @property
+    def end(self) -> int:
+        """Number of the revolution after the last one that is kept."""
+        return self._kept[-1].revolution + 1 if self._kept else 0
+
+    def forget(self) -> None:
+        """Keep nothing of what was."""
+        self._kept.clear()
+        self._rest_z, self._rest_turns = self._rest_z[:0], self._rest_turns[:0]
 
     def add(self, revolution: int, first_index: int, turns: Floats, z: Complexes) -> None:
         """Keep a revolution.
@@ -127,7 +197,7 @@ class LastPositions:
         if there.mean() < 1.0 - _MOST_MISSING:
             return None
         z[~there] = 0.0
-        return Stretch(z, turns, there, self._rate_hz / self._averaged, self._averaged)
+        return Stretch(z, turns, there, self._rate_hz / self._averaged, self._averaged, first)
 
 
 def _after_gaps(kept: list[_Kept]) -> list[_Kept]:

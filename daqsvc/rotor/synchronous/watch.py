@@ -41,7 +41,7 @@ from daqsvc.rotor.synchronous.judged import (
     thrice_of,
 )
 from daqsvc.rotor.synchronous.lessons import Lessons
-from daqsvc.rotor.synchronous.nonsynchronous import EVERY, Found, NonsynchronousSearch
+from daqsvc.rotor.synchronous.nonsynchronous import EVERY, Found, HealthyOrbit, NonsynchronousSearch
 from daqsvc.rotor.synchronous.signatures import Identification, NamingRules, WithoutLine, identify
 from daqsvc.rotor.synchronous.speed_law import EARLIER_SPEEDS
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
@@ -489,7 +489,9 @@ class RotorWatch:
         if now is not None and self._thrice is not None:
             change = np.append(change, now.mean - self._thrice.mean)
             variance = np.append(variance, now.apart_from(self._thrice, self._healthy.amplitude_um))
-        found = self._lines.evaluate(revolution, self._healthy)
+        known = self._healthy
+        orbit = HealthyOrbit(known.baseline, known.noise, known.rotor.clearance_um)
+        found = self._lines.evaluate(revolution, orbit)
         self._identification = identify(
             change,
             variance,

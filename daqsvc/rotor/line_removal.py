@@ -1,0 +1,292 @@
+"""Takes a line that is none of the rotor's out of the positions that its observers see.
+
+The observers of a bank know motions of a rotor and noise. Mains that cables pick up are neither. The observer
+that allows for most, that of a rub, follows them best. A line that is known is taken out before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousSearch
+from daqsvc.rotor.synchronous.positions import REVOLUTIONS, turning
+from daqsvc.rotor.synchronous.vectors import HARMONICS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.synchronous.nonsynchronous import Found, HealthyOrbit, NonsynchronousLine
+    from daqsvc.rotor.synchronous.positions import Stretch
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+_FITTED_EVERY = 4
+"""Revolutions after which a line is fitted again: the mains wander."""
+_FITTED_REV = 64.0
+_BEATS = 2.0
+"""Beats with the nearest harmonic that a fit needs, if that takes longer."""
+_TUNINGS = 3
+_MOST_OFF = 0.25
+"""Part of a turn, over half a fit, by which a frequency may be corrected in it."""
+_CONTACT_FREE = 0.9
+"""An orbit within this part of the clearance makes no lines of its own by touching."""
+_WRAPPED = 0.5
+"""Turns by which an angle goes back where it begins to count again."""
+_CHANGED = 0.5
+"""Part of a line's power by which positions without it must differ from those with it."""
+
+
+class _Motion(NamedTuple):
+    """A line with its phase, and the rotor beside it.
+
+    Attributes:
+        hz: float64 ``[F]``, signed frequencies.
+        amplitudes: complex128 ``[F]``, um.
+        origin: sample at which they have no phase.
+        orders: harmonics of the shaft.
+        harmonics: complex128 ``[H]``, um.
+    """
+
+    hz: Floats
+    amplitudes: Complexes
+    origin: float
+    orders: list[int]
+    harmonics: Complexes
+
+    @property
+    def power(self) -> float:
+        """Mean square of the line, um^2."""
+        return float((np.abs(self.amplitudes) ** 2).sum())
+
+    def at(self, samples: Floats, rate_hz: float) -> Complexes:
+        """The line at samples, complex128 ``[n]``, um."""
+        seconds = (samples - self.origin) / rate_hz
+        return np.asarray(np.exp(2j * math.pi * np.outer(seconds, self.hz)) @ self.amplitudes)
+
+
+class LineRemoval:
+    """Finds a foreign line while a machine is not healthy, and takes it out for as long as it is there.
+
+    Foreign are the mains, a modulation by the poles of a motor, and a line beside a harmonic of an orbit that
+    touches nothing. What a rub leaves is not.
+
+    Args:
+        rate_hz: sampling rate.
+        clearance_um: radial.
+        clockwise: whether the shaft turns so.
+    """
+
+    def __init__(self, rate_hz: float, clearance_um: float, *, clockwise: bool) -> None:
+        self._rate_hz, self._clearance_um = rate_hz, clearance_um
+        self._direction = -1.0 if clockwise else 1.0
+        self._search = NonsynchronousSearch(rate_hz)
+        self._blocks: list[tuple[Floats, Floats]] = []
+        self._first_index = self._covered = self._revolution = 0
+        self._turns, self._next_index = 0.0, 0
+        self._looking, self._unhealthy = False, -1
+        self._line: NonsynchronousLine | None = None
+        self._motion: _Motion | None = None
+        self._fitted = 0
+        self._is_out = False
+        self._gains: deque[float] = deque(maxlen=1)
+        self._doubted = 0
+
+    @property
+    def line(self) -> NonsynchronousLine | None:
+        """The line that is taken out; None if there is none."""
+        return self._line
+
+    def forget(self) -> None:
+        """Keep nothing, as after a gap whose length is a guess: which phase a line has is not known."""
+        self._search.forget()
+        self._blocks, self._covered = [], 0
+        self._line, self._motion, self._looking, self._is_out = None, None, False, False
+
+    def without(self, first_index: int, angle_rad: Floats, xy: Floats, samples_per_rev: int) -> Floats:
+        """Take in a block.
+
+        Args:
+            first_index: of its first sample.
+            angle_rad: float64 ``[n]``, shaft angle, growing, in whatever turn; NaN where not known.
+            xy: float64 ``[n, 2]``, positions in clearances; NaN where missing.
+            samples_per_rev: of a revolution.
+
+        Returns:
+            float64 ``[n, 2]``, the positions without the line; NaN where it seems to end.
+        """
+        if not len(xy) or not self._looking:
+            return xy
+        if not self._blocks:
+            self._first_index = first_index
+        self._blocks.append((angle_rad, xy.copy()))
+        self._covered += len(xy)
+        if self._covered >= samples_per_rev:
+            self._keep(samples_per_rev)
+        motion = self._motion
+        if motion is None:
+            return xy
+        z = self._of(xy)
+        line = motion.at(np.arange(first_index, first_index + len(z), dtype=np.float64), self._rate_hz)
+        if np.isfinite(angle_rad).all():
+            rotor = turning(angle_rad / math.tau, motion.orders) @ motion.harmonics
+            if self._weigh(z, line, rotor, samples_per_rev):
+                return np.full_like(xy, np.nan)
+        if not self._is_out:
+            return xy
+        left = (z - line) / self._clearance_um
+        return np.column_stack((left.real, self._direction * left.imag))
+
+    def _keep(self, samples_per_rev: int) -> None:
+        """Keep the blocks so far as a revolution, its angle on from that of the one before."""
+        angle_rad, xy = map(np.concatenate, zip(*self._blocks, strict=True))
+        self._blocks, self._covered = [], 0
+        turns = angle_rad / math.tau
+        if not np.isfinite(turns).all():
+            return
+        expected = self._turns + (self._first_index - self._next_index) / samples_per_rev
+        turns += round(expected - float(turns[0]))
+        turns[1:] += np.cumsum(np.diff(turns) < -_WRAPPED)
+        self._turns, self._next_index = float(turns[-1]), self._first_index + len(turns) - 1
+        self._search.add(self._revolution, self._first_index, turns - self._revolution, self._of(xy))
+        self._revolution += 1
+
+    def _of(self, xy: Floats) -> Complexes:
+        """Positions in um, seen from where the shaft turns counter-clockwise."""
+        z = np.empty(len(xy), dtype=np.complex128)
+        z.real, z.imag = self._clearance_um * xy[:, 0], self._direction * self._clearance_um * xy[:, 1]
+        return z
+
+    def look(self, orbit: Callable[[], HealthyOrbit], *, healthy: bool) -> bool:
+        """Look for a line, at the end of a revolution.
+
+        Args:
+            orbit: gives the healthy one, seen from where the shaft turns counter-clockwise.
+            healthy: whether the machine is, by what it does without the line. In a beat it seems to be at
+                times.
+
+        Returns:
+            Whether another line is taken out from now on, or none any more.
+        """
+        if not healthy:
+            self._unhealthy = self._revolution
+            if not self._looking:
+                self.forget()
+                self._search.begin(self._revolution)
+                self._looking = True
+        elif self._line is None and self._revolution - self._unhealthy > REVOLUTIONS:
+            self._looking = False
+        if not self._looking:
+            return False
+        known = orbit()
+        found, before = self._search.evaluate(self._revolution - 1, known), self._line
+        self._line = found.line if found is not None and self._is_foreign(found.line) else None
+        if found is None or self._line is None:
+            self._motion, self._is_out = None, False
+        elif before is None or self._revolution - self._fitted >= _FITTED_EVERY:
+            self._fit(found, known)
+            if before is None:
+                self._is_out = True
+                self._gains.clear()
+        return (before is None) != (self._line is None)
+
+    def _is_foreign(self, line: NonsynchronousLine) -> bool:
+        if line.mains or line.poles is not None:
+            return True
+        if not line.beats or line.modulates is not None:
+            return False
+        last = self._search.last(_FITTED_REV)
+        return last is not None and float(np.abs(last.z).max()) < _CONTACT_FREE * self._clearance_um
+
+    def _fit(self, found: Found, orbit: HealthyOrbit) -> None:
+        line = found.line
+        apart = abs(line.order - round(line.order))
+        stretch = self._search.last(max(_FITTED_REV, _BEATS / max(apart, 1e-9)))
+        if stretch is not None:
+            self._motion = _of_part(stretch, line, orbit) if found.is_partial else _fitted(stretch, line)
+            self._fitted = self._revolution
+
+    def _weigh(self, z: Complexes, line: Complexes, rotor: Complexes, samples_per_rev: int) -> bool:
+        """See by the last revolution whether the line is there: it may end long before a fit shows it.
+
+        Returns:
+            Whether this block alone raises a doubt, so that it is no evidence.
+        """
+        known = np.isfinite(z)
+        if self._motion is None or not known.any():
+            return False
+        blocks = max(1, round(samples_per_rev / len(z)))
+        if self._gains.maxlen != blocks:
+            self._gains = deque(self._gains, maxlen=blocks)
+        off = (z - rotor)[known]
+        with_it, without, alone = (
+            float((np.abs(one) ** 2).mean()) for one in (off, off - line[known], line[known])
+        )
+        self._gains.append((with_it - without) / max(self._motion.power, 1e-30))
+        if len(self._gains) == blocks:
+            gain = sum(self._gains) / blocks
+            self._is_out = gain > -_CHANGED if self._is_out else gain > _CHANGED
+        doubted = self._is_out and with_it - without < -_CHANGED * alone
+        self._doubted = self._doubted + 1 if doubted else 0
+        return 0 < self._doubted <= blocks
+
+
+def _fitted(stretch: Stretch, line: NonsynchronousLine) -> _Motion:
+    """A line and the harmonics together, at the frequency that fits best."""
+    seconds = np.arange(len(stretch.z)) / stretch.rate_hz
+    centred = seconds - seconds.mean()
+    hz = line.frequency_hz
+    shaft_hz = hz / line.order
+    harmonics = stretch.harmonics
+    count = harmonics.shape[1]
+    most_hz = _MOST_OFF / max(float(centred[-1]), 1e-9)
+    follows = np.array([1.0, -1.0, -1.0, 1.0])
+    for _ in range(_TUNINGS):
+        going = np.exp(2j * math.pi * np.outer(seconds, _signed(hz, shaft_hz, line.modulates)))
+        fit = stretch.fit(harmonics, going, centred[:, np.newaxis] * going)
+        amplitudes, slopes = np.split(fit[count:], 2)
+        turned = (slopes * amplitudes.conj()).imag * follows[: len(slopes)]
+        off_hz = float(turned.sum() / (np.abs(amplitudes) ** 2).sum()) / math.tau
+        hz += min(max(off_hz, -most_hz), most_hz)
+    signed = _signed(hz, shaft_hz, line.modulates)
+    fit = stretch.fit(harmonics, np.exp(2j * math.pi * np.outer(seconds, signed)))
+    return _motion(stretch, signed, fit[count:], stretch.orders, fit[:count])
+
+
+def _of_part(stretch: Stretch, line: NonsynchronousLine, orbit: HealthyOrbit) -> _Motion:
+    """A line by a part of its beat with a harmonic, beside the healthy orbit."""
+    signed = _signed(line.frequency_hz, line.frequency_hz / line.order, None)
+    seconds = np.arange(len(stretch.z)) / stretch.rate_hz
+    off = stretch.off(orbit.baseline)
+    return _motion(
+        off,
+        signed,
+        off.fit(np.exp(2j * math.pi * np.outer(seconds, signed))),
+        list(HARMONICS),
+        orbit.baseline,
+    )
+
+
+def _motion(
+    stretch: Stretch, hz: Floats, amplitudes: Complexes, orders: list[int], harmonics: Complexes
+) -> _Motion:
+    """The same at the samples, of which each position is the mean of some."""
+    count = stretch.averaged
+    origin = stretch.first * count + (count - 1) / 2.0
+    at_samples = np.sinc(hz / stretch.rate_hz / count) / np.sinc(hz / stretch.rate_hz)
+    return _Motion(hz, amplitudes * at_samples, origin, orders, harmonics)
+
+
+def _signed(hz: float, shaft_hz: float, modulates: int | None) -> Floats:
+    """Frequencies of a line in both senses, and of that on the other side of a harmonic."""
+    frequencies = [hz, -hz]
+    if modulates is not None:
+        mirror = 2.0 * modulates * shaft_hz - hz
+        frequencies += [mirror, -mirror]
+    return np.array(frequencies)

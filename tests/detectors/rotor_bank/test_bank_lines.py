@@ -1,0 +1,233 @@
+"""Lines that are none of the rotor's: a bank leaves them out, judges the rest, and states whose they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import rotor_runs as runs
+from support.shaft_channels import feed
+
+from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector
+from daqsvc.detectors.rotor_bank.recorded import bank_verdict
+from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.recorded import Statements
+from daqsvc.recording.recording import Recording
+
+SNR_DB = 20.0
+BEGINS = 150
+KNOWN = 150
+"""Revolutions within which a line is known, but for slow beats."""
+
+
+def flat_line(hz, um):
+    """As cables pick it up: the same in both probes, but for the gain."""
+    return lambda t: um * (1.0 + 0.3j) * np.cos(math.tau * hz * t + 0.3)
+
+
+def round_line(hz, um):
+    return lambda t: um * np.exp(1j * (math.tau * hz * t + 0.3))
+
+
+def modulation(shaft_hz, often_hz, um):
+    """1X of a motor whose poles pass so often."""
+    return lambda t: um * np.exp(1j * math.tau * shaft_hz * t) * np.cos(math.tau * often_hz * t + 0.3)
+
+
+FOREIGN = {
+    "mains below 1X": (83.0, flat_line(50.0, 12.0), 50.0, "these are the mains"),
+    "mains above 1X": (41.0, flat_line(50.0, 9.0), 50.0, "these are the mains"),
+    "mains beside 1X": (49.6, flat_line(49.97, 12.0), 49.97, "these are the mains"),
+    "twice the mains beside 2X": (49.6, round_line(100.05, 12.0), 100.05, "twice the mains"),
+    "twice the mains": (24.7, round_line(100.0, 8.0), 100.0, "twice the mains"),
+    "another machine": (31.3, round_line(32.6, 8.0), 32.6, "at no harmonic of the shaft"),
+    "poles that pass": (24.7, modulation(24.7, 1.2, 16.0), 25.9, "induction motor of 4 poles"),
+}
+
+
+def bank(shaft_hz, **options):
+    return RotorBankDetector(
+        machine="rig",
+        stream="shaft",
+        rate_hz=runs.PER_REV * shaft_hz,
+        speed_rpm=60.0 * shaft_hz,
+        probes=(Probe("probe-x", 0, 0.0), Probe("probe-y", 1, 90.0)),
+        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
+        rotor=replace(runs.ROTOR, natural_frequency_hz=shaft_hz),
+        modes=runs.TWELVE_MODES,
+        noise_um=runs.CLEARANCE_UM * runs.sigma(SNR_DB),
+        **options,
+    )
+
+
+def channels(shaft_hz, line, revolutions, *, changes=(), ends=None, seed=1):
+    """Channels of the rig at a speed, with a line from revolution 150 on."""
+    samples = runs.run(changes, revolutions, seed).channels(SNR_DB, seed)
+    at = np.arange(len(samples))
+    there = (at >= BEGINS * runs.PER_REV) & (at < (math.inf if ends is None else ends * runs.PER_REV))
+    motion = np.where(there, line(at / (runs.PER_REV * shaft_hz)), 0.0)
+    samples[:, 0] += motion.real
+    samples[:, 1] += motion.imag
+    return samples
+
+
+def said_of(shaft_hz, samples, **options):
+    subject = bank(shaft_hz, **options)
+    return subject, feed(subject, samples, runs.PER_REV * shaft_hz, block=16, first_index=0)
+
+
+def after(said, revolution):
+    return [one for one in said if one.revolutions > revolution]
+
+
+@pytest.mark.parametrize(("shaft_hz", "line", "hz", "whose"), FOREIGN.values(), ids=FOREIGN.keys())
+def test_what_is_not_the_rotors_is_no_fault(shaft_hz, line, hz, whose):
+    subject, said = said_of(shaft_hz, channels(shaft_hz, line, 700))
+    # The observers alone take it for a fault: without this the test would show nothing.
+    assert {one.decision for one in after(said, BEGINS)} - {"N", "departure"}
+    late = after(said, BEGINS + 2 * KNOWN)
+    assert {one.decision for one in late} == {"N"}
+    assert not any(one.changed for one in late)
+    assert all(one.probabilities["N"] > 0.99 for one in late)
+    for one in late:
+        assert one.quality == "good"
+        assert whose in one.reason
+        assert "left out" in one.reason
+        stated_hz = one.statistics["line.frequency"]
+        # Either of a pair may be stated.
+        assert min(abs(stated_hz - hz), abs(stated_hz - 2.0 * shaft_hz + hz)) < 0.1
+        assert one.units["line.frequency"] == "Hz"
+    assert subject.line is not None
+
+
+@pytest.mark.parametrize("fault", ["U2", "L2", "K2", "D1"])
+@pytest.mark.parametrize("name", ["mains below 1X", "mains beside 1X", "twice the mains"])
+def test_a_fault_beside_a_line_is_named(name, fault):
+    shaft_hz, line, _, _ = FOREIGN[name]
+    begins = 500
+    samples = channels(shaft_hz, line, 800, changes=[(begins, runs.TWELVE_PLANTS[fault])])
+    _, said = said_of(shaft_hz, samples)
+    assert {one.decision for one in said if BEGINS + 2 * KNOWN < one.revolutions < begins - 1} == {"N"}
+    last = said[-1]
+    # At the critical speed the steady orbits of both are nearly the same.
+    same = {"U2", "D1"} if fault in {"U2", "D1"} else {fault}
+    assert last.decision in same
+    assert set(last.group) <= same | {"U1", "D2"}
+    assert "line.frequency" in last.statistics
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_the_end_of_a_line_is_no_change(name):
+    shaft_hz, line, _, _ = FOREIGN[name]
+    ends = 600
+    subject, said = said_of(shaft_hz, channels(shaft_hz, line, 1000, ends=ends))
+    assert {one.decision for one in after(said, ends - 10)} == {"N"}
+    assert subject.line is None
+    assert said[-1].reason == ""
+
+
+@pytest.mark.parametrize("shaft_hz", [24.7, 49.6, 50.0])
+@pytest.mark.parametrize(
+    "fault", [{"damping_ratio": 0.02}, {"damping_ratio": 0.1, "eccentricity": 0.3}, {"eccentricity": 0.4}]
+)
+def test_nothing_is_left_out_of_a_rub(shaft_hz, fault):
+    subject, said = said_of(shaft_hz, channels(shaft_hz, flat_line(50.0, 0.0), 600, changes=[(200, fault)]))
+    assert said[-1].decision == "R"
+    assert subject.line is None
+    assert not any("line.frequency" in one.statistics for one in said)
+
+
+def test_a_rub_beside_the_mains_is_a_rub():
+    shaft_hz, line, _, _ = FOREIGN["mains below 1X"]
+    samples = channels(shaft_hz, line, 800, changes=[(500, runs.TWELVE_PLANTS["R"])])
+    _, said = said_of(shaft_hz, samples)
+    assert said[-1].decision == "R"
+    assert next(one for one in after(said, 495) if one.decision == "R").revolutions < 505
+
+
+def test_a_line_in_the_calibration_is_left_out_as_well():
+    shaft_hz = 83.0
+    samples = channels(shaft_hz, flat_line(50.0, 0.0), 600)
+    motion = flat_line(50.0, 12.0)(np.arange(len(samples)) / (runs.PER_REV * shaft_hz))
+    samples[:, 0] += motion.real
+    samples[:, 1] += motion.imag
+    _, said = said_of(shaft_hz, samples, calibrate_revolutions=60)
+    late = after(said, 60 + 2 * KNOWN)
+    assert {one.decision for one in late} == {"N"}
+    assert all("these are the mains" in one.reason for one in late)
+
+
+def test_a_shaft_that_turns_the_other_way_is_judged_alike():
+    shaft_hz, line, hz, whose = FOREIGN["another machine"]
+    samples = channels(shaft_hz, line, 600)
+    mirrored = samples.copy()
+    mirrored[:, 0] *= -1.0
+    subject = RotorBankDetector(
+        machine="rig",
+        stream="shaft",
+        rate_hz=runs.PER_REV * shaft_hz,
+        speed_rpm=-60.0 * shaft_hz,
+        probes=(Probe("probe-x", 0, 0.0), Probe("probe-y", 1, 90.0)),
+        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
+        rotor=replace(runs.ROTOR, natural_frequency_hz=shaft_hz),
+        modes=runs.TWELVE_MODES,
+        noise_um=runs.CLEARANCE_UM * runs.sigma(SNR_DB),
+        calibrate_revolutions=60,
+    )
+    said = feed(subject, mirrored, runs.PER_REV * shaft_hz, block=16, first_index=0)
+    assert said[-1].decision == "N"
+    assert whose in said[-1].reason
+    assert subject.line is not None
+    assert subject.line.forward is True
+    assert said[-1].statistics["line.frequency"] == pytest.approx(hz, abs=0.1)
+
+
+def test_it_goes_on_over_a_gap_of_known_length_and_starts_again_after_a_guess():
+    shaft_hz, line, _, _ = FOREIGN["mains below 1X"]
+    rate_hz = runs.PER_REV * shaft_hz
+    samples = channels(shaft_hz, line, 1000)
+    for breaks, known in ((False, True), (True, False)):
+        subject = bank(shaft_hz)
+        begin, end = 600 * runs.PER_REV, 606 * runs.PER_REV + 17
+        feed(subject, samples[:begin], rate_hz, block=16, first_index=0)
+        assert subject.line is not None
+        part = samples[end : end + 4 * runs.PER_REV]
+        at = end + len(part)
+        offsets = (0,) if breaks else ()
+        window = Window(end, part, round((at - 1) * 1e9 / rate_hz), 1e9 / rate_hz, breaks=offsets)
+        said = list(subject.process(window))
+        assert (subject.line is not None) == known
+        said += feed(subject, samples[at:], rate_hz, block=16, first_index=at)
+        assert said[-1].decision == "N"
+        assert subject.line is not None
+        if known:
+            assert {one.decision for one in said} == {"N"}
+
+
+def test_the_papers_rule_is_left_as_it_is():
+    shaft_hz, line, _, _ = FOREIGN["twice the mains"]
+    subject, _ = said_of(shaft_hz, channels(shaft_hz, line, 500), rules=replace(runs_rules(), rule="paper"))
+    assert subject.line is None
+
+
+def runs_rules():
+    return bank(24.7).rules
+
+
+def test_a_recording_states_the_line():
+    shaft_hz, line, hz, _ = FOREIGN["mains below 1X"]
+    samples = channels(shaft_hz, line, 600)
+    subject, said = said_of(shaft_hz, samples)
+    rate_hz = runs.PER_REV * shaft_hz
+    recording = Recording(("probe-x", "probe-y", "keyphasor"), samples, rate_hz, Path("one.npz"), 0)
+    verdict = bank_verdict(
+        recording, Statements("rotor-bank", said, rate_hz), subject.faults, closed=True, line=subject.line
+    )
+    assert verdict.verdict == "normal"
+    stated = verdict.as_json()["line"]
+    assert stated["frequency_hz"] == pytest.approx(hz, abs=0.1)
+    assert (stated["mains"], stated["is_the_change"]) == (1, True)
+    assert "is left out: these are the mains" in verdict.describe()
