@@ -32,7 +32,7 @@ _FITTED_EVERY = 4
 _FITTED_REV = 64.0
 _BEATS = 2.0
 """Beats with the nearest harmonic that a fit needs, if that takes longer."""
-_TUNINGS = 3
+_TUNINGS = 2
 _MOST_OFF = 0.25
 """Part of a turn, over half a fit, by which a frequency may be corrected in it."""
 _CONTACT_FREE = 0.9

@@ -573,7 +573,7 @@ def _shown_by(now: Stretch, line: NonsynchronousLine) -> float:
 
 
 def _is_same(now: NonsynchronousLine, then: NonsynchronousLine) -> bool:
-    """Whether two lines are one, some revolutions later; more of them may show whose it is."""
+    """Whether two lines are one, some revolutions later; more of them may show that it is the mains."""
     alike = now.modulates == then.modulates and then.mains in {0, now.mains}
     return alike and abs(now.order - then.order) < _NEAR
 
