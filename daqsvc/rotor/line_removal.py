@@ -27,12 +27,23 @@ if TYPE_CHECKING:
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
+_MOST_LINES = 3
+_SETTLED_REV = 8
+"""Revolutions after which the observers have settled without a line."""
+_FORGIVEN = 1.0 / 16.0
+"""Of a revolution in which it was not healthy, by one in which it is."""
 _FITTED_EVERY = 4
 """Revolutions after which a line is fitted again: the mains wander."""
 _FITTED_REV = 64.0
 _BEATS = 2.0
 """Beats with the nearest harmonic that a fit needs, if that takes longer."""
 _TUNINGS = 2
+_MOST_MULTIPLES = 6
+"""Multiples of the mains that are taken out with them ..."""
+_APART_BINS = 2.5
+"""... if they are as far from a harmonic ..."""
+_SHOWN = 0.45
+"""... and below this part of the rate of the positions."""
 _MOST_OFF = 0.25
 """Part of a turn, over half a fit, by which a frequency may be corrected in it."""
 _CONTACT_FREE = 0.9
@@ -40,7 +51,7 @@ _CONTACT_FREE = 0.9
 _WRAPPED = 0.5
 """Turns by which an angle goes back where it begins to count again."""
 _CHANGED = 0.5
-"""Part of a line's power by which positions without it must differ from those with it."""
+"""Of what is left beside the rotor's motion with a line or without it, the part that shows which is true."""
 
 
 class _Motion(NamedTuple):
@@ -60,11 +71,6 @@ class _Motion(NamedTuple):
     orders: list[int]
     harmonics: Complexes
 
-    @property
-    def power(self) -> float:
-        """Mean square of the line, um^2."""
-        return float((np.abs(self.amplitudes) ** 2).sum())
-
     def at(self, samples: Floats, rate_hz: float) -> Complexes:
         """The line at samples, complex128 ``[n]``, um."""
         seconds = (samples - self.origin) / rate_hz
@@ -72,10 +78,11 @@ class _Motion(NamedTuple):
 
 
 class LineRemoval:
-    """Finds a foreign line while a machine is not healthy, and takes it out for as long as it is there.
+    """Finds foreign lines while a machine is not healthy, and takes them out for as long as they are there.
 
     Foreign are the mains, a modulation by the poles of a motor, and a line beside a harmonic of an orbit that
-    touches nothing. What a rub leaves is not.
+    touches nothing. What a rub leaves is not. Another line is looked for where the machine is not healthy
+    without those that are known, three in all.
 
     Args:
         rate_hz: sampling rate.
@@ -84,30 +91,22 @@ class LineRemoval:
     """
 
     def __init__(self, rate_hz: float, clearance_um: float, *, clockwise: bool) -> None:
-        self._rate_hz, self._clearance_um = rate_hz, clearance_um
-        self._direction = -1.0 if clockwise else 1.0
-        self._search = NonsynchronousSearch(rate_hz)
-        self._blocks: list[tuple[Floats, Floats]] = []
-        self._first_index = self._covered = self._revolution = 0
-        self._turns, self._next_index = 0.0, 0
-        self._looking, self._unhealthy = False, -1
-        self._line: NonsynchronousLine | None = None
-        self._motion: _Motion | None = None
-        self._fitted = 0
-        self._is_out = False
-        self._gains: deque[float] = deque(maxlen=1)
-        self._doubted = 0
+        # Only the first line may be all that is new.
+        self._each = tuple(
+            _OneLine(rate_hz, clearance_um, clockwise=clockwise, is_first=i == 0) for i in range(_MOST_LINES)
+        )
+        self._unhealthy = 0.0
 
     @property
-    def line(self) -> NonsynchronousLine | None:
-        """The line that is taken out; None if there is none."""
-        return self._line
+    def lines(self) -> tuple[NonsynchronousLine, ...]:
+        """The lines that are taken out, the largest first."""
+        known = (one.line for one in self._each if one.line is not None)
+        return tuple(sorted(known, key=lambda line: -line.amplitude_um))
 
     def forget(self) -> None:
         """Keep nothing, as after a gap whose length is a guess: which phase a line has is not known."""
-        self._search.forget()
-        self._blocks, self._covered = [], 0
-        self._line, self._motion, self._looking, self._is_out = None, None, False, False
+        for one in self._each:
+            one.forget()
 
     def without(self, first_index: int, angle_rad: Floats, xy: Floats, samples_per_rev: int) -> Floats:
         """Take in a block.
@@ -119,8 +118,67 @@ class LineRemoval:
             samples_per_rev: of a revolution.
 
         Returns:
-            float64 ``[n, 2]``, the positions without the line; NaN where it seems to end.
+            float64 ``[n, 2]``, the positions without the lines; NaN where one seems to end.
         """
+        for one in self._each:
+            xy = one.without(first_index, angle_rad, xy, samples_per_rev)
+        return xy
+
+    def look(self, orbit: Callable[[], HealthyOrbit], *, healthy: bool) -> bool:
+        """Look for lines, at the end of a revolution.
+
+        Args:
+            orbit: gives the healthy one, seen from where the shaft turns counter-clockwise.
+            healthy: whether the machine is, by what it does without the lines. In a beat it seems to be at
+                times.
+
+        Returns:
+            Whether other lines are taken out from now on.
+        """
+        # What beats makes the machine healthy at times, also for most of them.
+        self._unhealthy = max(0.0, self._unhealthy + (-_FORGIVEN if healthy else 1.0))
+        for i, one in enumerate(self._each):
+            if one.look(orbit, healthy=healthy or (i > 0 and self._unhealthy < _SETTLED_REV)):
+                self._unhealthy = 0.0
+                for later in self._each[i + 1 :]:
+                    later.forget()
+                return True
+            if one.line is None:
+                break
+        return False
+
+
+class _OneLine:
+    """The same of one line; arguments as of `LineRemoval`."""
+
+    def __init__(self, rate_hz: float, clearance_um: float, *, clockwise: bool, is_first: bool) -> None:
+        self._rate_hz, self._clearance_um = rate_hz, clearance_um
+        self._direction = -1.0 if clockwise else 1.0
+        self._search = NonsynchronousSearch(rate_hz, by_part_of_beat=is_first)
+        self._blocks: list[tuple[Floats, Floats]] = []
+        self._first_index = self._covered = self._revolution = 0
+        self._turns, self._next_index = 0.0, 0
+        self._looking, self._unhealthy = False, -1
+        self._line: NonsynchronousLine | None = None
+        self._motion: _Motion | None = None
+        self._fitted = 0
+        self._is_out = False
+        self._left: deque[tuple[float, float]] = deque(maxlen=1)
+        self._doubted = 0
+
+    @property
+    def line(self) -> NonsynchronousLine | None:
+        """The line that is taken out; None if there is none."""
+        return self._line
+
+    def forget(self) -> None:
+        """Keep nothing."""
+        self._search.forget()
+        self._blocks, self._covered = [], 0
+        self._line, self._motion, self._looking, self._is_out = None, None, False, False
+
+    def without(self, first_index: int, angle_rad: Floats, xy: Floats, samples_per_rev: int) -> Floats:
+        """Take in a block."""
         if not len(xy) or not self._looking:
             return xy
         if not self._blocks:
@@ -164,16 +222,7 @@ class LineRemoval:
         return z
 
     def look(self, orbit: Callable[[], HealthyOrbit], *, healthy: bool) -> bool:
-        """Look for a line, at the end of a revolution.
-
-        Args:
-            orbit: gives the healthy one, seen from where the shaft turns counter-clockwise.
-            healthy: whether the machine is, by what it does without the line. In a beat it seems to be at
-                times.
-
-        Returns:
-            Whether another line is taken out from now on, or none any more.
-        """
+        """Look for a line; whether it is taken out from now on, or not any more."""
         if not healthy:
             self._unhealthy = self._revolution
             if not self._looking:
@@ -193,7 +242,7 @@ class LineRemoval:
             self._fit(found, known)
             if before is None:
                 self._is_out = True
-                self._gains.clear()
+                self._left.clear()
         return (before is None) != (self._line is None)
 
     def _is_foreign(self, line: NonsynchronousLine) -> bool:
@@ -213,7 +262,7 @@ class LineRemoval:
             self._fitted = self._revolution
 
     def _weigh(self, z: Complexes, line: Complexes, rotor: Complexes, samples_per_rev: int) -> bool:
-        """See by the last revolution whether the line is there: it may end long before a fit shows it.
+        """See by the last two revolutions whether the line is there: it may end long before a fit shows it.
 
         Returns:
             Whether this block alone raises a doubt, so that it is no evidence.
@@ -222,18 +271,20 @@ class LineRemoval:
         if self._motion is None or not known.any():
             return False
         blocks = max(1, round(samples_per_rev / len(z)))
-        if self._gains.maxlen != blocks:
-            self._gains = deque(self._gains, maxlen=blocks)
+        if self._left.maxlen != 2 * blocks:
+            self._left = deque(self._left, maxlen=2 * blocks)
         off = (z - rotor)[known]
-        with_it, without, alone = (
-            float((np.abs(one) ** 2).mean()) for one in (off, off - line[known], line[known])
+        with_it, without = (float((np.abs(one) ** 2).mean()) for one in (off, off - line[known]))
+        self._left.append((with_it, without))
+        if len(self._left) < 2 * blocks:
+            return False
+        # A fault, or another line, leaves much of both: then nothing shows.
+        (was_with, was_without), (now_with, now_without) = np.reshape(self._left, (2, blocks, 2)).sum(axis=1)
+        self._is_out = bool(
+            now_with > _CHANGED * now_without if self._is_out else now_without < _CHANGED * now_with
         )
-        self._gains.append((with_it - without) / max(self._motion.power, 1e-30))
-        if len(self._gains) == blocks:
-            gain = sum(self._gains) / blocks
-            self._is_out = gain > -_CHANGED if self._is_out else gain > _CHANGED
-        doubted = self._is_out and with_it - without < -_CHANGED * alone
-        self._doubted = self._doubted + 1 if doubted else 0
+        clear = self._is_out and was_without < _CHANGED * was_with
+        self._doubted = self._doubted + 1 if clear and with_it < _CHANGED * without else 0
         return 0 < self._doubted <= blocks
 
 
@@ -241,27 +292,47 @@ def _fitted(stretch: Stretch, line: NonsynchronousLine) -> _Motion:
     """A line and the harmonics together, at the frequency that fits best."""
     seconds = np.arange(len(stretch.z)) / stretch.rate_hz
     centred = seconds - seconds.mean()
-    hz = line.frequency_hz
-    shaft_hz = hz / line.order
+    hz, (factors, fixed_hz) = line.frequency_hz, _family(line, stretch)
     harmonics = stretch.harmonics
     count = harmonics.shape[1]
     most_hz = _MOST_OFF / max(float(centred[-1]), 1e-9)
-    follows = np.array([1.0, -1.0, -1.0, 1.0])
     for _ in range(_TUNINGS):
-        going = np.exp(2j * math.pi * np.outer(seconds, _signed(hz, shaft_hz, line.modulates)))
+        going = np.exp(2j * math.pi * np.outer(seconds, factors * hz + fixed_hz))
         fit = stretch.fit(harmonics, going, centred[:, np.newaxis] * going)
         amplitudes, slopes = np.split(fit[count:], 2)
-        turned = (slopes * amplitudes.conj()).imag * follows[: len(slopes)]
-        off_hz = float(turned.sum() / (np.abs(amplitudes) ** 2).sum()) / math.tau
+        turned = factors @ (slopes * amplitudes.conj()).imag
+        off_hz = float(turned / (factors**2 @ np.abs(amplitudes) ** 2)) / math.tau
         hz += min(max(off_hz, -most_hz), most_hz)
-    signed = _signed(hz, shaft_hz, line.modulates)
+    signed = factors * hz + fixed_hz
     fit = stretch.fit(harmonics, np.exp(2j * math.pi * np.outer(seconds, signed)))
     return _motion(stretch, signed, fit[count:], stretch.orders, fit[:count])
 
 
+def _family(line: NonsynchronousLine, stretch: Stretch) -> tuple[Floats, Floats]:
+    """What comes with a line: each frequency as a multiple of that of the line, and what is added, in Hz.
+
+    A line on the other side of a harmonic comes with one that modulates it. With the mains their multiples
+    come, as no hum is a pure tone.
+    """
+    shaft_hz = line.frequency_hz / line.order
+    multiples, added_hz = [1.0], [0.0]
+    if line.modulates is not None:
+        multiples, added_hz = [1.0, -1.0], [0.0, 2.0 * line.modulates * shaft_hz]
+    elif line.mains:
+        for times in range(1, _MOST_MULTIPLES + 1):
+            order = times * line.order / line.mains
+            apart = abs(order - round(order)) * stretch.revolutions
+            shown = order * shaft_hz < _SHOWN * stretch.rate_hz
+            if times != line.mains and apart >= _APART_BINS and shown:
+                multiples.append(times / line.mains)
+                added_hz.append(0.0)
+    both = np.array(multiples + [-one for one in multiples])
+    return both, np.array(added_hz + [-one for one in added_hz])
+
+
 def _of_part(stretch: Stretch, line: NonsynchronousLine, orbit: HealthyOrbit) -> _Motion:
     """A line by a part of its beat with a harmonic, beside the healthy orbit."""
-    signed = _signed(line.frequency_hz, line.frequency_hz / line.order, None)
+    signed = np.array([line.frequency_hz, -line.frequency_hz])
     seconds = np.arange(len(stretch.z)) / stretch.rate_hz
     off = stretch.off(orbit.baseline)
     return _motion(
@@ -281,12 +352,3 @@ def _motion(
     origin = stretch.first * count + (count - 1) / 2.0
     at_samples = np.sinc(hz / stretch.rate_hz / count) / np.sinc(hz / stretch.rate_hz)
     return _Motion(hz, amplitudes * at_samples, origin, orders, harmonics)
-
-
-def _signed(hz: float, shaft_hz: float, modulates: int | None) -> Floats:
-    """Frequencies of a line in both senses, and of that on the other side of a harmonic."""
-    frequencies = [hz, -hz]
-    if modulates is not None:
-        mirror = 2.0 * modulates * shaft_hz - hz
-        frequencies += [mirror, -mirror]
-    return np.array(frequencies)

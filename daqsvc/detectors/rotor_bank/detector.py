@@ -271,9 +271,9 @@ class RotorBankDetector:
         return self._steady_faults is not None
 
     @property
-    def line(self) -> NonsynchronousLine | None:
-        """The line beside the shaft's harmonics that is left out of the positions; None if there is none."""
-        return self._lines.line
+    def lines(self) -> tuple[NonsynchronousLine, ...]:
+        """Lines beside the shaft's harmonics that are left out of the positions, the largest first."""
+        return self._lines.lines
 
     @property
     def bank_modes(self) -> tuple[BankMode, ...]:
@@ -412,7 +412,7 @@ class RotorBankDetector:
         if math.floor(self._revolutions) > math.floor(before):
             self._speeds.append(self._bank.speed)
             self._compare_steady(report)
-            self._look_for_line(report)
+            self._look_for_lines(report)
             began, self._progress_index = self._progress_index, end_index
             changed = self._take_besides()
             if changed:
@@ -495,8 +495,8 @@ class RotorBankDetector:
         others = [set() if one is None else set(one.others) for one in (before, now)]
         return self._decision != stated or others[0] != others[1]
 
-    def _look_for_line(self, report: BankReport) -> None:
-        """Take a line out from now on, or none any more: what the observers saw is of another motion then."""
+    def _look_for_lines(self, report: BankReport) -> None:
+        """Take other lines out from now on: what the observers saw is of another motion then."""
         bank = self._bank
         if self._rules.rule != "cusum" or bank.decision == UNDETERMINED or self._calibration is not None:
             return
@@ -713,7 +713,7 @@ class RotorBankDetector:
             changed=changed,
             off=self._change.off,
             besides=self._change.besides,
-            line=self._lines.line,
+            lines=self._lines.lines,
             missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
         )
 

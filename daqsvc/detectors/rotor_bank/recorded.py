@@ -60,7 +60,7 @@ class RecordedBank(RecordedDetector[RotorBank]):
                 statements,
                 detector.faults,
                 closed=not detector.knows_other_faults,
-                line=detector.line,
+                lines=detector.lines,
             ),
             partial(_draw, recorded.recording, statements, tuple(detector.faults)),
         )
@@ -78,7 +78,7 @@ def bank_verdict(
     faults: Mapping[str, str],
     *,
     closed: bool,
-    line: NonsynchronousLine | None = None,
+    lines: Sequence[NonsynchronousLine] = (),
 ) -> RotorVerdict:
     """What a recording reports about a rotor by its bank alone.
 
@@ -89,7 +89,7 @@ def bank_verdict(
         statements: all that the bank stated.
         faults: the fault that each mode represents.
         closed: whether the bank knows its modes and nothing else.
-        line: that it leaves out at the end.
+        lines: that it leaves out at the end, the largest first.
     """
     quality = known_against(recording)
     source = str(recording.source)
@@ -126,7 +126,7 @@ def bank_verdict(
         named=_fault(last.decision, faults) is not None,
         probabilities=chances,
         evidence=cast("dict[RotorFault, float]", dict(last.evidence)),
-        left_out=line,
+        left_out=tuple(lines),
         onset=_instant(onset, recording.rate_hz, last) if changed and onset is not None else None,
         departure=_instant(departed.end_index, recording.rate_hz, departed) if changed and departed else None,
         declaration=_instant(named.end_index, recording.rate_hz, named) if changed and named else None,

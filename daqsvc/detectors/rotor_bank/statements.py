@@ -92,7 +92,7 @@ class BankDiagnosisBuilder:
         changed: bool,
         off: Misfit | None,
         besides: Explanation | None,
-        line: NonsynchronousLine | None,
+        lines: Sequence[NonsynchronousLine],
         missing_share: float,
     ) -> Diagnosis:
         """A diagnosis.
@@ -106,7 +106,7 @@ class BankDiagnosisBuilder:
             changed: whether this states a change.
             off: how the modes miss the steady change; None where none was compared.
             besides: what else than the modes explains it; None where nothing does.
-            line: that is left out of the positions.
+            lines: that are left out of the positions, the largest first.
             missing_share: share of the samples of the last revolution that are missing.
         """
         names = [mode.name for mode in self.modes]
@@ -136,8 +136,8 @@ class BankDiagnosisBuilder:
         statistics |= {f"paper.{name}": float(p) for name, p in zip(names, paper, strict=True)}
         if off is not None and not math.isnan(missed := float(off.part[decision])):
             statistics["misfit"] = missed
-        if line is not None:
-            statistics |= line.figures()
+        if lines:
+            statistics |= lines[0].figures()
         return Diagnosis(
             machine=self.machine,
             detector=self.detector,
@@ -160,7 +160,7 @@ class BankDiagnosisBuilder:
             evidence=evidence,
             revolutions=moment.revolutions,
             quality=verdict.quality,
-            reason=verdict.reason or ("" if line is None else line.describe(left_out=True)),
+            reason=verdict.reason or "; ".join(line.describe(left_out=True) for line in lines),
             sensors=self.sensors,
             model=MODEL,
             missing_share=missing_share,

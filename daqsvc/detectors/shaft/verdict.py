@@ -302,7 +302,7 @@ class RotorVerdict(Verdict):
         level: how large each fault of the group would be, in its own terms
             (`daqsvc.rotor.synchronous.severity`).
         identification: what the last evaluation saw; None while the machine is healthy.
-        left_out: line that the bank leaves out of the positions at the end; None if there is none.
+        left_out: lines that the bank leaves out of the positions at the end, the largest first.
         onset: estimated begin of the change.
         departure: where the alarm is raised.
         declaration: where the final group was first named.
@@ -327,7 +327,7 @@ class RotorVerdict(Verdict):
     severity: float | None = None
     level: Mapping[RotorFault, Mapping[str, float]] = field(default_factory=dict)
     identification: Identification | None = None
-    left_out: NonsynchronousLine | None = None
+    left_out: tuple[NonsynchronousLine, ...] = ()
     onset: Instant | None = None
     departure: Instant | None = None
     declaration: Instant | None = None
@@ -403,8 +403,7 @@ class RotorVerdict(Verdict):
                 for fault, level in self.level.items()
                 if level
             ]
-        if self.left_out is not None:
-            lines.append(self.left_out.describe(left_out=True))
+        lines += [line.describe(left_out=True) for line in self.left_out]
         if self.calibration is not None:
             was = self.calibration
             lines.append(
@@ -457,8 +456,8 @@ class RotorVerdict(Verdict):
 
     def _line(self) -> LineJson | None:
         now = self.identification
-        if self.left_out is not None:
-            return _line_json(self.left_out, is_the_change=self.verdict == "normal")
+        if self.left_out:
+            return _line_json(self.left_out[0], is_the_change=self.verdict == "normal")
         return None if now is None or now.line is None else _line_json(now.line, is_the_change=now.by_line)
 
     def _named(self) -> str:

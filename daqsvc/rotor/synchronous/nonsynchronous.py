@@ -260,7 +260,12 @@ class _Before(NamedTuple):
 
 
 def _new_line(
-    now: Stretch, before: _Before | None, healthy: HealthyOrbit, speed_uncertainty: float = 0.0
+    now: Stretch,
+    before: _Before | None,
+    healthy: HealthyOrbit,
+    speed_uncertainty: float = 0.0,
+    *,
+    by_part_of_beat: bool = True,
 ) -> Found | None:
     """The line beside the harmonics that came with a change: that of the mains, or else the strongest.
 
@@ -269,12 +274,13 @@ def _new_line(
         before: the machine before it; None if not known.
         healthy: its baseline.
         speed_uncertainty: relative standard deviation of the speed: a line as near to a harmonic may be it.
+        by_part_of_beat: whether the mains may be found by less than a beat.
     """
     shaft_hz = float(now.revolutions * now.rate_hz / np.ptp(np.flatnonzero(now.there)))
     found = None
     if now.revolutions >= LEAST_REVOLUTIONS:
         found = _standing_out(now, before, shaft_hz, healthy)
-    if found is None:
+    if found is None and by_part_of_beat:
         found = _mains_in_a_beat(now, before, shaft_hz, healthy)
     if found is None:
         return None
@@ -447,7 +453,7 @@ def _mains_in_a_beat(
     for hz, which in _mains():
         if not _is_near(hz / shaft_hz):
             continue
-        for share in np.linspace(-GRID_SHARE, GRID_SHARE, _GRID_STEPS):
+        for share in np.linspace(-GRID_SHARE, GRID_SHARE, _GRID_STEPS).tolist():
             square = float((np.abs(_sides(now, off, hz * (1.0 + share))) ** 2).sum())
             if square > best:
                 best, best_hz, mains = square, hz * (1.0 + share), which
@@ -486,10 +492,13 @@ class NonsynchronousSearch:
     Args:
         rate_hz: sampling rate.
         speed_uncertainty: relative standard deviation of a stated speed that replaces a keyphasor.
+        by_part_of_beat: whether the mains may be found by less than a beat, as all that is new.
     """
 
-    def __init__(self, rate_hz: float, speed_uncertainty: float = 0.0) -> None:
-        self._speed_uncertainty = speed_uncertainty
+    def __init__(
+        self, rate_hz: float, speed_uncertainty: float = 0.0, *, by_part_of_beat: bool = True
+    ) -> None:
+        self._speed_uncertainty, self._by_part_of_beat = speed_uncertainty, by_part_of_beat
         self._positions = LastPositions(rate_hz)
         self._before: _Before | None = None
         self._since: int | None = None
@@ -562,7 +571,13 @@ class NonsynchronousSearch:
         return found if found.line.amplitude_um >= _HALF * self._most_um else None
 
     def _new_line(self, now: Stretch, healthy: HealthyOrbit) -> Found | None:
-        return _new_line(now, self._before, healthy, self._speed_uncertainty)
+        return _new_line(
+            now,
+            self._before,
+            healthy,
+            self._speed_uncertainty,
+            by_part_of_beat=self._by_part_of_beat,
+        )
 
 
 def _shown_by(now: Stretch, line: NonsynchronousLine) -> float:

@@ -100,7 +100,7 @@ def test_what_is_not_the_rotors_is_no_fault(shaft_hz, line, hz, whose):
         # Either of a pair may be stated.
         assert min(abs(stated_hz - hz), abs(stated_hz - 2.0 * shaft_hz + hz)) < 0.1
         assert one.units["line.frequency"] == "Hz"
-    assert subject.line is not None
+    assert subject.lines
 
 
 @pytest.mark.parametrize("fault", ["U2", "L2", "K2", "D1"])
@@ -125,7 +125,7 @@ def test_the_end_of_a_line_is_no_change(name):
     ends = 600
     subject, said = said_of(shaft_hz, channels(shaft_hz, line, 1000, ends=ends))
     assert {one.decision for one in after(said, ends - 10)} == {"N"}
-    assert subject.line is None
+    assert not subject.lines
     assert said[-1].reason == ""
 
 
@@ -136,7 +136,7 @@ def test_the_end_of_a_line_is_no_change(name):
 def test_nothing_is_left_out_of_a_rub(shaft_hz, fault):
     subject, said = said_of(shaft_hz, channels(shaft_hz, flat_line(50.0, 0.0), 600, changes=[(200, fault)]))
     assert said[-1].decision == "R"
-    assert subject.line is None
+    assert not subject.lines
     assert not any("line.frequency" in one.statistics for one in said)
 
 
@@ -146,6 +146,28 @@ def test_a_rub_beside_the_mains_is_a_rub():
     _, said = said_of(shaft_hz, samples)
     assert said[-1].decision == "R"
     assert next(one for one in after(said, 495) if one.decision == "R").revolutions < 505
+
+
+def hum(hz, um):
+    """The mains with what comes with them."""
+    tones = [flat_line(hz * times, um / times) for times in (1, 2, 3)]
+    return lambda t: sum(tone(t) for tone in tones)
+
+
+@pytest.mark.parametrize(("shaft_hz", "hz"), [(41.0, 50.0), (83.0, 50.0), (49.6, 49.97), (61.0, 60.0)])
+def test_a_hum_that_is_no_pure_tone_is_left_out_whole(shaft_hz, hz):
+    subject, said = said_of(shaft_hz, channels(shaft_hz, hum(hz, 12.0), 1200))
+    late = after(said, 900)
+    assert {one.decision for one in late} == {"N"}
+    assert subject.lines
+
+
+def test_two_lines_of_two_machines_are_both_stated():
+    both = lambda t: flat_line(50.0, 9.0)(t) + round_line(32.6, 8.0)(t)  # noqa: E731
+    subject, said = said_of(31.3, channels(31.3, both, 1200))
+    assert {one.decision for one in after(said, 900)} == {"N"}
+    assert {round(one.frequency_hz, 1) for one in subject.lines} == {50.0, 32.6}
+    assert said[-1].reason.count("left out") == 2
 
 
 def test_a_line_in_the_calibration_is_left_out_as_well():
@@ -180,8 +202,8 @@ def test_a_shaft_that_turns_the_other_way_is_judged_alike():
     said = feed(subject, mirrored, runs.PER_REV * shaft_hz, block=16, first_index=0)
     assert said[-1].decision == "N"
     assert whose in said[-1].reason
-    assert subject.line is not None
-    assert subject.line.forward is True
+    assert subject.lines
+    assert subject.lines[0].forward is True
     assert said[-1].statistics["line.frequency"] == pytest.approx(hz, abs=0.1)
 
 
@@ -193,16 +215,16 @@ def test_it_goes_on_over_a_gap_of_known_length_and_starts_again_after_a_guess():
         subject = bank(shaft_hz)
         begin, end = 600 * runs.PER_REV, 606 * runs.PER_REV + 17
         feed(subject, samples[:begin], rate_hz, block=16, first_index=0)
-        assert subject.line is not None
+        assert subject.lines
         part = samples[end : end + 4 * runs.PER_REV]
         at = end + len(part)
         offsets = (0,) if breaks else ()
         window = Window(end, part, round((at - 1) * 1e9 / rate_hz), 1e9 / rate_hz, breaks=offsets)
         said = list(subject.process(window))
-        assert (subject.line is not None) == known
+        assert bool(subject.lines) == known
         said += feed(subject, samples[at:], rate_hz, block=16, first_index=at)
         assert said[-1].decision == "N"
-        assert subject.line is not None
+        assert subject.lines
         if known:
             assert {one.decision for one in said} == {"N"}
 
@@ -210,7 +232,7 @@ def test_it_goes_on_over_a_gap_of_known_length_and_starts_again_after_a_guess():
 def test_the_papers_rule_is_left_as_it_is():
     shaft_hz, line, _, _ = FOREIGN["twice the mains"]
     subject, _ = said_of(shaft_hz, channels(shaft_hz, line, 500), rules=replace(runs_rules(), rule="paper"))
-    assert subject.line is None
+    assert not subject.lines
 
 
 def runs_rules():
@@ -224,7 +246,7 @@ def test_a_recording_states_the_line():
     rate_hz = runs.PER_REV * shaft_hz
     recording = Recording(("probe-x", "probe-y", "keyphasor"), samples, rate_hz, Path("one.npz"), 0)
     verdict = bank_verdict(
-        recording, Statements("rotor-bank", said, rate_hz), subject.faults, closed=True, line=subject.line
+        recording, Statements("rotor-bank", said, rate_hz), subject.faults, closed=True, lines=subject.lines
     )
     assert verdict.verdict == "normal"
     stated = verdict.as_json()["line"]

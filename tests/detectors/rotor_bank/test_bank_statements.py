@@ -51,7 +51,7 @@ def stated(*, decision, lead, together=(), besides=None):
         changed=False,
         off=Misfit(np.zeros(5), np.zeros(5, dtype=np.bool_), pairs),
         besides=besides,
-        line=None,
+        lines=(),
         missing_share=0.0,
     )
 
