@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousSearch
+from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousSearch, is_multiple_of_mains
 from daqsvc.rotor.synchronous.positions import REVOLUTIONS, turning
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
@@ -34,7 +34,7 @@ _FORGIVEN = 1.0 / 16.0
 """Of a revolution in which it was not healthy, by one in which it is."""
 _FITTED_EVERY = 4
 """Revolutions after which a line is fitted again: the mains wander."""
-_FITTED_REV = 64.0
+_FITTED_REV, _ENOUGH = 64.0, 0.9
 _BEATS = 2.0
 """Beats with the nearest harmonic that a fit needs, if that takes longer."""
 _TUNINGS = 2
@@ -80,27 +80,32 @@ class _Motion(NamedTuple):
 class LineRemoval:
     """Finds foreign lines while a machine is not healthy, and takes them out for as long as they are there.
 
-    Foreign are the mains, a modulation by the poles of a motor, and a line beside a harmonic of an orbit that
-    touches nothing. What a rub leaves is not. Another line is looked for where the machine is not healthy
-    without those that are known, three in all.
+    Foreign are the mains and twice the mains. While the orbit touches nothing, their multiples are, if they
+    go back and forth, and a modulation by the poles of a motor. Any other line may be a rub's. Another line is
+    looked for where the machine is not healthy without those that are known, three in all.
 
     Args:
         rate_hz: sampling rate.
         clearance_um: radial.
         clockwise: whether the shaft turns so.
+        ac_coupled: whether the probes show no static position, so that no orbit is known to touch nothing.
     """
 
-    def __init__(self, rate_hz: float, clearance_um: float, *, clockwise: bool) -> None:
+    def __init__(
+        self, rate_hz: float, clearance_um: float, *, clockwise: bool, ac_coupled: bool = False
+    ) -> None:
+        free_um = 0.0 if ac_coupled else _CONTACT_FREE * clearance_um
         # Only the first line may be all that is new.
         self._each = tuple(
-            _OneLine(rate_hz, clearance_um, clockwise=clockwise, is_first=i == 0) for i in range(_MOST_LINES)
+            _OneLine(rate_hz, clearance_um, clockwise=clockwise, free_um=free_um, is_first=i == 0)
+            for i in range(_MOST_LINES)
         )
         self._unhealthy = 0.0
 
     @property
     def lines(self) -> tuple[NonsynchronousLine, ...]:
         """The lines that are taken out, the largest first."""
-        known = (one.line for one in self._each if one.line is not None)
+        known = (one.line for one in self._each if one.line is not None and one.is_out)
         return tuple(sorted(known, key=lambda line: -line.amplitude_um))
 
     def forget(self) -> None:
@@ -149,38 +154,51 @@ class LineRemoval:
 
 
 class _OneLine:
-    """The same of one line; arguments as of `LineRemoval`."""
+    """The same of one line; arguments as of `LineRemoval`, and ``free_um``, in which nothing is touched."""
 
-    def __init__(self, rate_hz: float, clearance_um: float, *, clockwise: bool, is_first: bool) -> None:
+    def __init__(
+        self, rate_hz: float, clearance_um: float, *, clockwise: bool, free_um: float, is_first: bool
+    ) -> None:
+        self._free_um = free_um
         self._rate_hz, self._clearance_um = rate_hz, clearance_um
         self._direction = -1.0 if clockwise else 1.0
         self._search = NonsynchronousSearch(rate_hz, by_part_of_beat=is_first)
         self._blocks: list[tuple[Floats, Floats]] = []
-        self._first_index = self._covered = self._revolution = 0
+        self._first_index = self._end_index = self._covered = self._revolution = 0
         self._turns, self._next_index = 0.0, 0
         self._looking, self._unhealthy = False, -1
         self._line: NonsynchronousLine | None = None
         self._motion: _Motion | None = None
         self._fitted = 0
         self._is_out = False
-        self._left: deque[tuple[float, float]] = deque(maxlen=1)
+        self._left: deque[tuple[int, float, float]] = deque()
         self._doubted = 0
 
     @property
     def line(self) -> NonsynchronousLine | None:
-        """The line that is taken out; None if there is none."""
+        """The line that is known; None if there is none."""
         return self._line
+
+    @property
+    def is_out(self) -> bool:
+        """Whether it is taken out: not where it seems to have ended."""
+        return self._is_out and self._motion is not None
 
     def forget(self) -> None:
         """Keep nothing."""
         self._search.forget()
         self._blocks, self._covered = [], 0
         self._line, self._motion, self._looking, self._is_out = None, None, False, False
+        self._left.clear()
+        self._doubted = 0
 
     def without(self, first_index: int, angle_rad: Floats, xy: Floats, samples_per_rev: int) -> Floats:
         """Take in a block."""
         if not len(xy) or not self._looking:
             return xy
+        if first_index != self._end_index:
+            self._blocks, self._covered = [], 0
+        self._end_index = first_index + len(xy)
         if not self._blocks:
             self._first_index = first_index
         self._blocks.append((angle_rad, xy.copy()))
@@ -246,18 +264,19 @@ class _OneLine:
         return (before is None) != (self._line is None)
 
     def _is_foreign(self, line: NonsynchronousLine) -> bool:
-        if line.mains or line.poles is not None:
+        if line.mains:
             return True
-        if not line.beats or line.modulates is not None:
+        if line.poles is None and not (line.forward is None and is_multiple_of_mains(line.frequency_hz)):
             return False
         last = self._search.last(_FITTED_REV)
-        return last is not None and float(np.abs(last.z).max()) < _CONTACT_FREE * self._clearance_um
+        return last is not None and float(np.abs(last.z).max()) < self._free_um
 
     def _fit(self, found: Found, orbit: HealthyOrbit) -> None:
         line = found.line
         apart = abs(line.order - round(line.order))
         stretch = self._search.last(max(_FITTED_REV, _BEATS / max(apart, 1e-9)))
-        if stretch is not None:
+        # After a gap there are too few at first: the line as it was goes on.
+        if stretch is not None and stretch.revolutions > _ENOUGH * min(_FITTED_REV, found.revolutions):
             self._motion = _of_part(stretch, line, orbit) if found.is_partial else _fitted(stretch, line)
             self._fitted = self._revolution
 
@@ -265,27 +284,32 @@ class _OneLine:
         """See by the last two revolutions whether the line is there: it may end long before a fit shows it.
 
         Returns:
-            Whether this block alone raises a doubt, so that it is no evidence.
+            Whether this block raises a doubt, so that it is no evidence; for a revolution at most.
         """
         known = np.isfinite(z)
         if self._motion is None or not known.any():
             return False
-        blocks = max(1, round(samples_per_rev / len(z)))
-        if self._left.maxlen != 2 * blocks:
-            self._left = deque(self._left, maxlen=2 * blocks)
         off = (z - rotor)[known]
-        with_it, without = (float((np.abs(one) ** 2).mean()) for one in (off, off - line[known]))
-        self._left.append((with_it, without))
-        if len(self._left) < 2 * blocks:
+        with_it, without = (float((np.abs(one) ** 2).sum()) for one in (off, off - line[known]))
+        self._left.append((len(z), with_it, without))
+        while sum(one[0] for one in self._left) - self._left[0][0] >= 2 * samples_per_rev:
+            self._left.popleft()
+        ends = np.cumsum([one[0] for one in self._left])
+        if ends[-1] < 2 * samples_per_rev:
             return False
         # A fault, or another line, leaves much of both: then nothing shows.
-        (was_with, was_without), (now_with, now_without) = np.reshape(self._left, (2, blocks, 2)).sum(axis=1)
+        earlier = ends <= ends[-1] - samples_per_rev
+        left = np.array([one[1:] for one in self._left])
+        (was_with, was_without), (now_with, now_without) = (
+            left[earlier].sum(axis=0),
+            left[~earlier].sum(axis=0),
+        )
         self._is_out = bool(
             now_with > _CHANGED * now_without if self._is_out else now_without < _CHANGED * now_with
         )
         clear = self._is_out and was_without < _CHANGED * was_with
-        self._doubted = self._doubted + 1 if clear and with_it < _CHANGED * without else 0
-        return 0 < self._doubted <= blocks
+        self._doubted = self._doubted + len(z) if clear and with_it < _CHANGED * without else 0
+        return 0 < self._doubted <= samples_per_rev
 
 
 def _fitted(stretch: Stretch, line: NonsynchronousLine) -> _Motion:

@@ -244,7 +244,9 @@ class RotorBankDetector:
                 f"rotor bank of {machine!r}: calibrate_revolutions is {calibrate_revolutions}; "
                 "write 0 to trust the stated rotor, or 20 or more"
             )
-        self._lines = LineRemoval(rate_hz, rotor.clearance_um, clockwise=speed_rpm < 0.0)
+        self._lines = LineRemoval(
+            rate_hz, rotor.clearance_um, clockwise=speed_rpm < 0.0, ac_coupled=ac_coupled
+        )
         self._calibrate_revolutions = calibrate_revolutions
         self._calibration = SteadyFit() if calibrate_revolutions else None
         self._calibrated_speed = math.nan
@@ -342,6 +344,8 @@ class RotorBankDetector:
             first_index -= gap
         elif gap:
             self._begin_anew()
+            if gap < 0:  # the stream has begun again
+                self._lines.forget()
         self._next_index = end_index = first_index + len(samples)
         diagnoses: list[Diagnosis] = []
         for begin in range(0, len(samples), self.block):

@@ -77,6 +77,8 @@ _OIL_WHIRL = (0.35, 0.5)
 _MOST_OF_CLEARANCE = 0.5
 """No mains move a signal by more than this part of the clearance."""
 _GRID_STEPS = 9
+_MOST_MULTIPLES = 6
+"""Of the mains, that a hum has."""
 _LEAST_OVER_NOISE = 30.0
 """Power of the mains over that of noise in the same line, from which on they are found in a beat."""
 _ALL_OF_IT = 0.9
@@ -388,6 +390,15 @@ def _mains() -> Iterator[tuple[float, Mains]]:
     for mains_hz in LINE_FREQUENCIES_HZ:
         yield mains_hz, 1
         yield 2.0 * mains_hz, 2
+
+
+def is_multiple_of_mains(frequency_hz: float) -> bool:
+    """Whether a frequency is three to six times the mains, as near as the grid allows: a tone of a hum."""
+    for mains_hz in LINE_FREQUENCIES_HZ:
+        times = round(frequency_hz / mains_hz)
+        if 3 <= times <= _MOST_MULTIPLES and _is_mains(frequency_hz, times * mains_hz):
+            return True
+    return False
 
 
 def _is_mains(frequency_hz: float, mains_hz: float) -> bool:
