@@ -81,8 +81,8 @@ class LineRemoval:
     """Finds foreign lines while a machine is not healthy, and takes them out for as long as they are there.
 
     Foreign are the mains and twice the mains. While the orbit touches nothing, their multiples are, if they
-    go back and forth, and a modulation by the poles of a motor. Any other line may be a rub's. Another line is
-    looked for where the machine is not healthy without those that are known, three in all.
+    go back and forth, and a modulation by the poles of a motor. Any other line may be a rub's. Another line
+    is looked for where the machine is not healthy without those that are known, three in all.
 
     Args:
         rate_hz: sampling rate.
