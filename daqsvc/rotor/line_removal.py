@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from daqsvc.rotor.synchronous.nonsynchronous import NonsynchronousSearch, is_multiple_of_mains
+from daqsvc.rotor.synchronous.nonsynchronous import (
+    APART_BINS,
+    MOST_MULTIPLES,
+    NonsynchronousSearch,
+    is_multiple_of_mains,
+)
 from daqsvc.rotor.synchronous.positions import REVOLUTIONS, turning
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
@@ -38,12 +43,8 @@ _FITTED_REV, _ENOUGH = 64.0, 0.9
 _BEATS = 2.0
 """Beats with the nearest harmonic that a fit needs, if that takes longer."""
 _TUNINGS = 2
-_MOST_MULTIPLES = 6
-"""Multiples of the mains that are taken out with them ..."""
-_APART_BINS = 2.5
-"""... if they are as far from a harmonic ..."""
 _SHOWN = 0.45
-"""... and below this part of the rate of the positions."""
+"""Part of the rate of the positions, below which tones of a hum are taken out."""
 _MOST_OFF = 0.25
 """Part of a turn, over half a fit, by which a frequency may be corrected in it."""
 _CONTACT_FREE = 0.9
@@ -274,9 +275,10 @@ class _OneLine:
     def _fit(self, found: Found, orbit: HealthyOrbit) -> None:
         line = found.line
         apart = abs(line.order - round(line.order))
-        stretch = self._search.last(max(_FITTED_REV, _BEATS / max(apart, 1e-9)))
+        wanted_rev = max(_FITTED_REV, _BEATS / max(apart, 1e-9))
+        stretch = self._search.last(wanted_rev)
         # After a gap there are too few at first: the line as it was goes on.
-        if stretch is not None and stretch.revolutions > _ENOUGH * min(_FITTED_REV, found.revolutions):
+        if stretch is not None and stretch.revolutions > _ENOUGH * min(wanted_rev, found.revolutions):
             self._motion = _of_part(stretch, line, orbit) if found.is_partial else _fitted(stretch, line)
             self._fitted = self._revolution
 
@@ -343,11 +345,11 @@ def _family(line: NonsynchronousLine, stretch: Stretch) -> tuple[Floats, Floats]
     if line.modulates is not None:
         multiples, added_hz = [1.0, -1.0], [0.0, 2.0 * line.modulates * shaft_hz]
     elif line.mains:
-        for times in range(1, _MOST_MULTIPLES + 1):
+        for times in range(1, MOST_MULTIPLES + 1):
             order = times * line.order / line.mains
             apart = abs(order - round(order)) * stretch.revolutions
             shown = order * shaft_hz < _SHOWN * stretch.rate_hz
-            if times != line.mains and apart >= _APART_BINS and shown:
+            if times != line.mains and apart >= APART_BINS and shown:
                 multiples.append(times / line.mains)
                 added_hz.append(0.0)
     both = np.array(multiples + [-one for one in multiples])

@@ -506,11 +506,15 @@ class RotorBankDetector:
             return
         if not self._lines.look(self._healthy_orbit, healthy=bank.decision == 0 and report.departure is None):
             return
-        count = len(self._modes)
         bank.reseed()
-        bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
         self._watch.spoil()
+        self._compare_nothing()
+
+    def _compare_nothing(self) -> None:
+        """No steady change leaves any mode out."""
+        count = len(self._modes)
         self._change.off = None
+        self._bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
         if self._steady_faults is not None:
             self._steady_faults.forget()
 
@@ -541,10 +545,7 @@ class RotorBankDetector:
             )
         )
         if not (changed or certain):
-            self._change.off = None
-            bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
-            if self._steady_faults is not None:
-                self._steady_faults.forget()
+            self._compare_nothing()
             return
         if change is None:
             return

@@ -53,7 +53,7 @@ _SKIRT_BINS = (4, 10)
 _CORE_BINS = 2
 _WINDOW_BINS = 1.5
 """Bins of noise that Hann's window lets through."""
-_APART_BINS = 2.5
+APART_BINS = 2.5
 """Bins beside a harmonic where its own changes end up."""
 _KNOWN_BINS = 3.0
 """The same, from which on a line stays known."""
@@ -77,7 +77,7 @@ _OIL_WHIRL = (0.35, 0.5)
 _MOST_OF_CLEARANCE = 0.5
 """No mains move a signal by more than this part of the clearance."""
 _GRID_STEPS = 9
-_MOST_MULTIPLES = 6
+MOST_MULTIPLES = 6
 """Of the mains, that a hum has."""
 _LEAST_OVER_NOISE = 30.0
 """Power of the mains over that of noise in the same line, from which on they are found in a beat."""
@@ -363,7 +363,7 @@ def _mains_in(line: NonsynchronousLine, revolutions: float, healthy: HealthyOrbi
         return 0
     # What a rub leaves at a part of the speed may be at the mains by chance.
     parts = (abs(order - round(order * n) / n) for n in _DIVISORS)
-    if not _is_near(order) and any(part * revolutions < _APART_BINS for part in parts):
+    if not _is_near(order) and any(part * revolutions < APART_BINS for part in parts):
         return 0
     if line.forward is None:
         return mains
@@ -396,7 +396,7 @@ def is_multiple_of_mains(frequency_hz: float) -> bool:
     """Whether a frequency is three to six times the mains, as near as the grid allows: a tone of a hum."""
     for mains_hz in LINE_FREQUENCIES_HZ:
         times = round(frequency_hz / mains_hz)
-        if 3 <= times <= _MOST_MULTIPLES and _is_mains(frequency_hz, times * mains_hz):
+        if 3 <= times <= MOST_MULTIPLES and _is_mains(frequency_hz, times * mains_hz):
             return True
     return False
 
@@ -413,7 +413,7 @@ def _is_near(order: float) -> bool:
 def _strongest(spectrum: _Spectrum, shaft_hz: float) -> int:
     """The strongest bin that is beside the harmonics."""
     orders = np.arange(len(spectrum.power)) * (spectrum.step_hz / shaft_hz)
-    beside = np.abs(orders - np.round(orders)) * shaft_hz > _APART_BINS * spectrum.step_hz
+    beside = np.abs(orders - np.round(orders)) * shaft_hz > APART_BINS * spectrum.step_hz
     return int(np.where(beside & (orders < _HIGHEST), spectrum.power, 0.0).argmax())
 
 
@@ -421,7 +421,7 @@ def _stands_out(spectrum: _Spectrum, at: int, shaft_hz: float, least_db: float) 
     """Whether a bin is a sharp line at no harmonic."""
     per_rev = shaft_hz / spectrum.step_hz
     apart = abs(at - round(at / per_rev) * per_rev)
-    return apart >= _APART_BINS and spectrum.level_db(at) >= least_db and spectrum.is_sharp(at)
+    return apart >= APART_BINS and spectrum.level_db(at) >= least_db and spectrum.is_sharp(at)
 
 
 def _mirrored(spectrum: _Spectrum, at: int, shaft_hz: float) -> bool:

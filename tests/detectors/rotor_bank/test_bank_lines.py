@@ -295,6 +295,21 @@ def test_it_goes_on_over_a_gap_of_known_length_and_starts_again_after_a_guess():
             assert {one.decision for one in said} == {"N"}
 
 
+@pytest.mark.parametrize("name", all_of(FOREIGN, "mains beside 1X"))
+def test_a_fit_after_a_gap_waits_for_as_many_revolutions_as_tell_line_and_harmonic_apart(name):
+    shaft_hz, line, hz, _ = FOREIGN[name]
+    rate_hz = runs.PER_REV * shaft_hz
+    samples = channels(shaft_hz, line, 1200)
+    subject = bank(shaft_hz)
+    begin, end = 700 * runs.PER_REV, 705 * runs.PER_REV + 17
+    feed(subject, samples[:begin], rate_hz, block=16, first_index=0)
+    said = feed(subject, samples[end:], rate_hz, block=16, first_index=end)
+    assert {one.decision for one in said} == {"N"}
+    assert all("left out" in one.reason for one in said if one.quality == "good")
+    pair = (hz, 2.0 * shaft_hz - hz)
+    assert min(abs(said[-1].statistics["line.frequency"] - one) for one in pair) < 0.1
+
+
 def test_the_papers_rule_is_left_as_it_is():
     shaft_hz, line, _, _ = FOREIGN["twice the mains"]
     subject, _ = said_of(shaft_hz, channels(shaft_hz, line, 500), rules=replace(runs_rules(), rule="paper"))
