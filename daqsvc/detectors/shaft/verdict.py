@@ -440,6 +440,9 @@ class RotorVerdict(Verdict):
             return (
                 f"normal at the end of {self.revolutions} revolutions, but {raised} raised and cleared before"
             )
+        if self.verdict == "normal" and self.left_out:
+            # Until a line was known it was taken for a fault: the history has it.
+            return f"normal at the end of {self.revolutions} revolutions, without a line that is left out"
         if self.verdict == "normal":
             return f"normal through {self.revolutions} revolutions"
         if not self.named:

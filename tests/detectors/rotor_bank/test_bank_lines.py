@@ -333,4 +333,5 @@ def test_a_recording_states_the_line():
     stated = verdict.as_json()["line"]
     assert stated["frequency_hz"] == pytest.approx(hz, abs=0.1)
     assert (stated["mains"], stated["is_the_change"]) == (1, True)
+    assert "normal at the end of 600 revolutions, without a line that is left out" in verdict.describe()
     assert "is left out: these are the mains" in verdict.describe()
