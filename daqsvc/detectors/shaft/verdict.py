@@ -440,11 +440,11 @@ class RotorVerdict(Verdict):
             return (
                 f"normal at the end of {self.revolutions} revolutions, but {raised} raised and cleared before"
             )
-        if self.verdict == "normal" and self.left_out:
-            # Until a line was known it was taken for a fault: the history has it.
-            return f"normal at the end of {self.revolutions} revolutions, without a line that is left out"
         if self.verdict == "normal":
-            return f"normal through {self.revolutions} revolutions"
+            # Until a line was known it was taken for a fault: the history has it.
+            through = "at the end of" if self.left_out else "through"
+            without = ", without a line that is left out" if self.left_out else ""
+            return f"normal {through} {self.revolutions} revolutions{without}"
         if not self.named:
             modes += " (not yet settled)"
         elif len(self.group) > 1 and chance >= _CLEAR:
